@@ -1,0 +1,17 @@
+"""The one exception that the user is meant to read."""
+
+from __future__ import annotations
+
+
+class GknetError(Exception):
+    """Bad input or a missing piece. The message is one line: what, what was expected, what came, the remedy.
+
+    The command line prints it without a traceback and exits with code 2.
+    """
+
+
+class MissingExtraError(GknetError):
+    """An optional part of gknet was asked for that is not installed."""
+
+    def __init__(self, extra: str, module: str) -> None:
+        super().__init__(f"this needs the module '{module}': pip install 'gknet[{extra}]'")

@@ -1,0 +1,143 @@
+"""What flows through gknet: a `Frame` goes in, an `Estimate` comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+
+from gknet.errors import GknetError
+from gknet.geometry import Camera, Pose
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in pixels: [x0, x1] x [y0, y1]."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.x0, self.y0, self.x1, self.y1]).all() and self.x1 > self.x0 and self.y1 > self.y0):
+            raise GknetError(f"box: expected x0 < x1 and y0 < y1, got {self.x0}, {self.y0}, {self.x1}, {self.y1}")
+
+    @staticmethod
+    def around(pixels: Float[ndarray, "n 2"]) -> Box:
+        """The bounding box of the finite points, at least one pixel wide and high."""
+        finite = pixels[np.isfinite(pixels).all(axis=1)]
+        if len(finite) == 0:
+            raise GknetError("box: no finite point to bound")
+        low, high = finite.min(axis=0), finite.max(axis=0)
+        grow = np.maximum(0, 1 - (high - low)) / 2
+        (x0, y0), (x1, y1) = low - grow, high + grow
+        return Box(float(x0), float(y0), float(x1), float(y1))
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
+    @property
+    def side(self) -> float:
+        """The longer side."""
+        return max(self.x1 - self.x0, self.y1 - self.y0)
+
+    @property
+    def area(self) -> float:
+        return (self.x1 - self.x0) * (self.y1 - self.y0)
+
+    def clipped(self, width: int, height: int) -> Box | None:
+        """The part inside an image, or None when nothing is."""
+        x0, y0 = max(self.x0, 0.0), max(self.y0, 0.0)
+        x1, y1 = min(self.x1, float(width)), min(self.y1, float(height))
+        return Box(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
+
+    def iou(self, other: Box) -> float:
+        """Intersection over union, 0 to 1."""
+        width = min(self.x1, other.x1) - max(self.x0, other.x0)
+        height = min(self.y1, other.y1) - max(self.y0, other.y0)
+        if width <= 0 or height <= 0:
+            return 0.0
+        shared = width * height
+        return shared / (self.area + other.area - shared)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture and what is known of it.
+
+    image          (h, w, 3) uint8 RGB; None where only the labels were read
+    visible        (n,) bool per keypoint: in view and not hidden by the spacecraft; None when unknown
+    sun_direction  unit vector to the sun in the camera frame
+    """
+
+    name: str
+    image: UInt8[ndarray, "h w 3"] | None
+    camera: Camera
+    cam_from_body: Pose | None = None
+    visible: Bool[ndarray, "n"] | None = None
+    sun_direction: Float[ndarray, "3"] | None = None
+    time_s: float | None = None
+
+    def keypoints_px(self, points_m: Float[ndarray, "n 3"]) -> Float[ndarray, "n 2"]:
+        """The true keypoints in pixels, projected from the pose; NaN behind the camera."""
+        if self.cam_from_body is None:
+            raise GknetError(f"frame {self.name}: it has no true pose")
+        return self.camera.project(self.cam_from_body.transform(points_m))
+
+    def true_box(self, points_m: Float[ndarray, "n 3"]) -> Box | None:
+        """The box of the true keypoints inside the image (the oracle's crop), None when none is inside."""
+        box = Box.around(self.keypoints_px(points_m))
+        return box.clipped(self.camera.width, self.camera.height)
+
+    @property
+    def range_m(self) -> float | None:
+        return None if self.cam_from_body is None else float(np.linalg.norm(self.cam_from_body.translation_m))
+
+    @property
+    def phase_angle_rad(self) -> float | None:
+        """Angle at the spacecraft between the sun and the camera, 0 (lit from behind the camera) to pi."""
+        if self.cam_from_body is None or self.sun_direction is None:
+            return None
+        to_camera = -self.cam_from_body.translation_m / np.linalg.norm(self.cam_from_body.translation_m)
+        return float(np.arccos(np.clip(to_camera @ self.sun_direction, -1, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Detected keypoints in pixels of the full image. Row k is keypoint k of the spacecraft, always.
+
+    pixels          (n, 2)
+    score           (n,) 0 to 1
+    covariance_px2  (n, 2, 2)
+    """
+
+    pixels: Float[ndarray, "n 2"]
+    score: Float[ndarray, "n"]
+    covariance_px2: Float[ndarray, "n 2 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The answer for one image. `failure` says why there is no pose, and is None exactly when there is one.
+
+    covariance   (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
+                 R_true = exp([dw]x) R, t_true = t + dt
+    inliers      (n,) bool: keypoints that the pose agrees with
+    box          where the spacecraft was looked for, in pixels of the image
+    """
+
+    keypoints: Keypoints | None = None
+    cam_from_body: Pose | None = None
+    covariance: Float[ndarray, "6 6"] | None = None
+    inliers: Bool[ndarray, "n"] | None = None
+    reprojection_rms_px: float | None = None
+    box: Box | None = None
+    failure: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.cam_from_body is None) != (self.failure is not None):
+            raise GknetError("estimate: expected either a pose or the reason why there is none")

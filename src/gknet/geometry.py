@@ -1,0 +1,156 @@
+"""Poses and cameras: OpenCV axes (x right, y down, z forward), metres, radians, pixels.
+
+The centre of the top-left pixel is (0.5, 0.5), so an image spans [0, W] x [0, H] and resizing is pure scaling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from gknet.errors import GknetError
+
+
+def _finite(name: str, value: object, shape: tuple[int, ...]) -> ndarray:
+    """`value` as a read-only float64 array of `shape`, or a GknetError that names it."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GknetError(f"{name}: expected numbers of shape {shape}, got {value!r}") from error
+    if array.shape != shape:
+        raise GknetError(f"{name}: expected shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise GknetError(f"{name}: expected finite numbers, got NaN or infinity")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A rigid motion `a_from_b`: p_a = rotation @ p_b + translation_m."""
+
+    rotation: Float[ndarray, "3 3"]
+    translation_m: Float[ndarray, "3"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation", _finite("rotation", self.rotation, (3, 3)))
+        object.__setattr__(self, "translation_m", _finite("translation_m", self.translation_m, (3,)))
+        error = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
+        if error > 1e-5 or np.linalg.det(self.rotation) < 0:
+            raise GknetError(f"rotation: expected a proper rotation matrix, got one off by {error:.1e}")
+
+    @staticmethod
+    def identity() -> Pose:
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_quaternion(wxyz: object, translation_m: object) -> Pose:
+        """From a Hamilton quaternion, scalar first; normalised here, zero is an error."""
+        quaternion = _finite("quaternion wxyz", wxyz, (4,))
+        if np.linalg.norm(quaternion) < 1e-9:
+            raise GknetError("quaternion wxyz: expected a unit quaternion, got zero")
+        rotation = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+        return Pose(rotation, np.asarray(translation_m))
+
+    @staticmethod
+    def from_rotation_vector(rotation_vector_rad: object, translation_m: object) -> Pose:
+        vector = _finite("rotation vector", rotation_vector_rad, (3,))
+        return Pose(Rotation.from_rotvec(vector).as_matrix(), np.asarray(translation_m))
+
+    @property
+    def quaternion_wxyz(self) -> Float[ndarray, "4"]:
+        """Hamilton, scalar first, w >= 0."""
+        xyzw = Rotation.from_matrix(self.rotation).as_quat()
+        wxyz = xyzw[[3, 0, 1, 2]]
+        return -wxyz if wxyz[0] < 0 else wxyz
+
+    @property
+    def rotation_vector_rad(self) -> Float[ndarray, "3"]:
+        return Rotation.from_matrix(self.rotation).as_rotvec()
+
+    def inverse(self) -> Pose:
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation_m)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """a_from_c = a_from_b @ b_from_c."""
+        rotation = self.rotation @ other.rotation
+        return Pose(rotation, self.rotation @ other.translation_m + self.translation_m)
+
+    def transform(self, points_m: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
+        """Points of frame b in frame a."""
+        return points_m @ self.rotation.T + self.translation_m
+
+    def angle_to(self, other: Pose) -> float:
+        """Geodesic angle between the two rotations in rad, 0 to pi (eq. 8; q and -q are the same)."""
+        return float(Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude())
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with OpenCV's distortion (k1, k2, p1, p2, k3).
+
+    `matrix` is K for pixel coordinates whose top-left pixel centre is (0.5, 0.5).
+    """
+
+    matrix: Float[ndarray, "3 3"]
+    width: int
+    height: int
+    distortion: Float[ndarray, "5"] = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "matrix", _finite("camera matrix", self.matrix, (3, 3)))
+        object.__setattr__(self, "distortion", _finite("camera distortion", self.distortion, (5,)))
+        if self.width <= 0 or self.height <= 0:
+            raise GknetError(f"camera size: expected positive numbers, got {self.width} x {self.height}")
+        if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0 or not np.allclose(self.matrix[2], (0, 0, 1)):
+            raise GknetError("camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
+
+    @staticmethod
+    def from_focal(focal_px: float, width: int, height: int) -> Camera:
+        """A centred camera with square pixels."""
+        matrix = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]], dtype=np.float64)
+        return Camera(matrix, width, height)
+
+    @property
+    def distorted(self) -> bool:
+        return bool(np.any(self.distortion))
+
+    def project(self, points_cam_m: Float[ndarray, "n 3"]) -> Float[ndarray, "n 2"]:
+        """Pixels of points in the camera frame; NaN for a point at or behind the camera's plane."""
+        points = np.asarray(points_cam_m, dtype=np.float64)
+        in_front = points[:, 2] > 1e-9
+        pixels = np.full((len(points), 2), np.nan)
+        if in_front.any():
+            projected, _ = cv2.projectPoints(
+                points[in_front], np.zeros(3), np.zeros(3), self.matrix, np.asarray(self.distortion)
+            )
+            pixels[in_front] = projected[:, 0]
+        return pixels
+
+    def undistort(self, pixels: Float[ndarray, "n 2"]) -> Float[ndarray, "n 2"]:
+        """Where the same rays would fall without distortion."""
+        if not self.distorted or len(pixels) == 0:
+            return np.asarray(pixels, dtype=np.float64)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+        source = np.asarray(pixels, dtype=np.float64)[:, None]
+        ideal = cv2.undistortPoints(
+            source, self.matrix, self.distortion, R=np.eye(3), P=self.matrix, criteria=criteria
+        )
+        return ideal[:, 0]
+
+    def contains(self, pixels: Float[ndarray, "n 2"]) -> ndarray:
+        """Boolean (n,): inside [0, W] x [0, H]; NaN is outside."""
+        return (
+            (pixels[:, 0] >= 0) & (pixels[:, 0] <= self.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] <= self.height)
+        )
+
+    def warped(self, out_from_image: Float[ndarray, "3 3"], width: int, height: int) -> Camera:
+        """The camera of an image warped by an affine map of pixels; only an undistorted camera can follow one."""
+        if self.distorted:
+            raise GknetError("camera: a warp of a distorted camera is no camera; undistort the image first")
+        return Camera(out_from_image @ self.matrix, width, height)

@@ -1,0 +1,169 @@
+"""A known spacecraft: its mesh, named keypoints, skeleton and symmetries, and the .toml that keeps them."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from gknet.errors import GknetError
+
+Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+
+
+class Symmetry(BaseModel):
+    """A turn of the body that leaves its look nearly (or exactly) unchanged."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    axis: Vector
+    angle_deg: FiniteFloat
+    exact: bool = False
+    broken_by: str = ""
+
+
+class _Keypoint(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    point_m: Vector
+
+
+class _File(BaseModel):
+    """The .toml file, as it is written."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    description: str = ""
+    mesh: str | None = None
+    diameter_m: Annotated[FiniteFloat, Field(gt=0)]
+    keypoint: Annotated[list[_Keypoint], Field(min_length=4)]
+    edges: list[tuple[str, str]]
+    symmetry: list[Symmetry] = []
+
+
+@dataclass(frozen=True, eq=False)
+class Spacecraft:
+    """`points_m` are in the body frame; row k, channel k of a heatmap and node k of the graph are all keypoint k.
+
+    edges        (e, 2) pairs of keypoint indices, i < j: the skeleton, by meaning and nearness
+    diameter_m   the largest distance between two points of the mesh
+    mesh_path    a GLB with PBR materials in metres, None when only the keypoints are known
+    """
+
+    name: str
+    keypoint_names: tuple[str, ...]
+    points_m: Float[ndarray, "n 3"]
+    edges: tuple[tuple[int, int], ...]
+    diameter_m: float
+    symmetries: tuple[Symmetry, ...] = ()
+    mesh_path: Path | None = None
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        points = np.array(self.points_m, dtype=np.float64)
+        points.setflags(write=False)
+        object.__setattr__(self, "points_m", points)
+        count = len(self.keypoint_names)
+        if points.shape != (count, 3) or not np.isfinite(points).all():
+            raise GknetError(f"{self.name}: expected {count} finite keypoints of shape ({count}, 3), got {points.shape}")
+        if len(set(self.keypoint_names)) != count:
+            raise GknetError(f"{self.name}: keypoint names must differ from each other")
+        for i, j in self.edges:
+            if not (0 <= i < count and 0 <= j < count and i != j):
+                raise GknetError(f"{self.name}: edge ({i}, {j}) is no pair of the keypoints 0 to {count - 1}")
+        ordered = tuple(sorted({(min(i, j), max(i, j)) for i, j in self.edges}))
+        object.__setattr__(self, "edges", ordered)
+
+    @property
+    def keypoint_count(self) -> int:
+        return len(self.keypoint_names)
+
+    @cached_property
+    def adjacency(self) -> Bool[ndarray, "n n"]:
+        """A of eq. 3: symmetric, ones on the diagonal, constant for the spacecraft."""
+        matrix = np.eye(self.keypoint_count, dtype=bool)
+        for i, j in self.edges:
+            matrix[i, j] = matrix[j, i] = True
+        return matrix
+
+
+def diameter(points_m: Float[ndarray, "n 3"]) -> float:
+    """The largest distance between two of the points."""
+    from scipy.spatial import ConvexHull
+
+    hull = points_m[ConvexHull(points_m).vertices]
+    return float(max(np.linalg.norm(a - b) for a, b in combinations(hull, 2)))
+
+
+def load_spacecraft(path: str | Path) -> Spacecraft:
+    """Read a spacecraft's .toml; its mesh is looked for beside it."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise GknetError(f"{path}: cannot read the spacecraft file ({error})") from error
+    try:
+        file = _File.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise GknetError(f"{path}: not valid TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise GknetError(f"{path}: {place}: {first['msg']}") from error
+    index = {keypoint.name: k for k, keypoint in enumerate(file.keypoint)}
+    for edge in file.edges:
+        for end in edge:
+            if end not in index:
+                raise GknetError(f"{path}: edges: '{end}' is no keypoint; expected one of {', '.join(index)}")
+    return Spacecraft(
+        name=file.name,
+        keypoint_names=tuple(keypoint.name for keypoint in file.keypoint),
+        points_m=np.array([keypoint.point_m for keypoint in file.keypoint]),
+        edges=tuple((index[a], index[b]) for a, b in file.edges),
+        diameter_m=file.diameter_m,
+        symmetries=tuple(file.symmetry),
+        mesh_path=path.parent / file.mesh if file.mesh else None,
+        description=file.description,
+    )
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ") + '"'
+
+
+def spacecraft_toml(spacecraft: Spacecraft) -> str:
+    """The text of a spacecraft's .toml, keypoints to a tenth of a millimetre."""
+    names = spacecraft.keypoint_names
+    lines = [f"name = {_quoted(spacecraft.name)}", f"description = {_quoted(spacecraft.description)}"]
+    if spacecraft.mesh_path is not None:
+        lines.append(f"mesh = {_quoted(spacecraft.mesh_path.name)}")
+    lines.append(f"diameter_m = {spacecraft.diameter_m:.4f}")
+    lines.append("edges = [")
+    lines += [f"  [{_quoted(names[i])}, {_quoted(names[j])}]," for i, j in spacecraft.edges]
+    lines.append("]")
+    for name, point in zip(names, spacecraft.points_m, strict=True):
+        coordinates = ", ".join(f"{value + 0.0:.4f}" for value in np.round(point, 4) + 0.0)
+        lines += ["", "[[keypoint]]", f"name = {_quoted(name)}", f"point_m = [{coordinates}]"]
+    for symmetry in spacecraft.symmetries:
+        axis = ", ".join(f"{value:g}" for value in symmetry.axis)
+        lines += ["", "[[symmetry]]", f"axis = [{axis}]", f"angle_deg = {symmetry.angle_deg:g}"]
+        lines += [f"exact = {str(symmetry.exact).lower()}", f"broken_by = {_quoted(symmetry.broken_by)}"]
+    return "\n".join(lines) + "\n"
+
+
+def save_spacecraft(spacecraft: Spacecraft, path: str | Path) -> None:
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(spacecraft_toml(spacecraft), encoding="utf-8")
+    os.replace(temporary, path)
