@@ -55,12 +55,12 @@ class Pose:
         if np.linalg.norm(quaternion) < 1e-9:
             raise GknetError("quaternion wxyz: expected a unit quaternion, got zero")
         rotation = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
-        return Pose(rotation, np.asarray(translation_m))
+        return Pose(rotation, _finite("translation_m", translation_m, (3,)))
 
     @staticmethod
     def from_rotation_vector(rotation_vector_rad: object, translation_m: object) -> Pose:
         vector = _finite("rotation vector", rotation_vector_rad, (3,))
-        return Pose(Rotation.from_rotvec(vector).as_matrix(), np.asarray(translation_m))
+        return Pose(Rotation.from_rotvec(vector.copy()).as_matrix(), _finite("translation_m", translation_m, (3,)))
 
     @property
     def quaternion_wxyz(self) -> Float[ndarray, "4"]:
@@ -107,8 +107,10 @@ class Camera:
         object.__setattr__(self, "distortion", _finite("camera distortion", self.distortion, (5,)))
         if self.width <= 0 or self.height <= 0:
             raise GknetError(f"camera size: expected positive numbers, got {self.width} x {self.height}")
-        if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0 or not np.allclose(self.matrix[2], (0, 0, 1)):
-            raise GknetError("camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
+        fx, fy = self.matrix[0, 0], self.matrix[1, 1]
+        plain = np.array([[fx, 0, self.matrix[0, 2]], [0, fy, self.matrix[1, 2]], [0, 0, 1]])
+        if fx <= 0 or fy <= 0 or not np.allclose(self.matrix, plain):
+            raise GknetError("camera matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
 
     @staticmethod
     def from_focal(focal_px: float, width: int, height: int) -> Camera:
@@ -138,19 +140,18 @@ class Camera:
             return np.asarray(pixels, dtype=np.float64)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
         source = np.asarray(pixels, dtype=np.float64)[:, None]
-        ideal = cv2.undistortPoints(
-            source, self.matrix, self.distortion, R=np.eye(3), P=self.matrix, criteria=criteria
-        )
+        ideal = cv2.undistortPoints(source, self.matrix, self.distortion, R=np.eye(3), P=self.matrix, criteria=criteria)
         return ideal[:, 0]
 
     def contains(self, pixels: Float[ndarray, "n 2"]) -> ndarray:
         """Boolean (n,): inside [0, W] x [0, H]; NaN is outside."""
-        return (
-            (pixels[:, 0] >= 0) & (pixels[:, 0] <= self.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] <= self.height)
-        )
+        return (pixels[:, 0] >= 0) & (pixels[:, 0] <= self.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] <= self.height)
 
     def warped(self, out_from_image: Float[ndarray, "3 3"], width: int, height: int) -> Camera:
-        """The camera of an image warped by an affine map of pixels; only an undistorted camera can follow one."""
+        """The camera of an image scaled and shifted by `out_from_image`; only an undistorted camera can follow.
+
+        A map that also turns or shears the image has no such camera and is refused.
+        """
         if self.distorted:
             raise GknetError("camera: a warp of a distorted camera is no camera; undistort the image first")
         return Camera(out_from_image @ self.matrix, width, height)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tomllib
 from dataclasses import dataclass
@@ -76,7 +77,9 @@ class Spacecraft:
         object.__setattr__(self, "points_m", points)
         count = len(self.keypoint_names)
         if points.shape != (count, 3) or not np.isfinite(points).all():
-            raise GknetError(f"{self.name}: expected {count} finite keypoints of shape ({count}, 3), got {points.shape}")
+            raise GknetError(
+                f"{self.name}: expected {count} finite keypoints of shape ({count}, 3), got {points.shape}"
+            )
         if len(set(self.keypoint_names)) != count:
             raise GknetError(f"{self.name}: keypoint names must differ from each other")
         for i, j in self.edges:
@@ -113,19 +116,17 @@ def load_spacecraft(path: str | Path) -> Spacecraft:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise GknetError(f"{path}: cannot read the spacecraft file ({error})") from error
-    try:
-        file = _File.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise GknetError(f"{path}: not valid TOML: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise GknetError(f"{path}: {place}: {first['msg']}") from error
+    return spacecraft_from_toml(text, str(path), path.parent)
+
+
+def spacecraft_from_toml(text: str, source: str, folder: Path | None = None) -> Spacecraft:
+    """Parse the text of a spacecraft's .toml. Errors name `source`; without a mesh's `folder` there is no mesh."""
+    file = _parse(text, source)
     index = {keypoint.name: k for k, keypoint in enumerate(file.keypoint)}
     for edge in file.edges:
         for end in edge:
             if end not in index:
-                raise GknetError(f"{path}: edges: '{end}' is no keypoint; expected one of {', '.join(index)}")
+                raise GknetError(f"{source}: edges: '{end}' is no keypoint; expected one of {', '.join(index)}")
     return Spacecraft(
         name=file.name,
         keypoint_names=tuple(keypoint.name for keypoint in file.keypoint),
@@ -133,13 +134,25 @@ def load_spacecraft(path: str | Path) -> Spacecraft:
         edges=tuple((index[a], index[b]) for a, b in file.edges),
         diameter_m=file.diameter_m,
         symmetries=tuple(file.symmetry),
-        mesh_path=path.parent / file.mesh if file.mesh else None,
+        mesh_path=folder / file.mesh if folder is not None and file.mesh else None,
         description=file.description,
     )
 
 
+def _parse(text: str, source: str) -> _File:
+    try:
+        return _File.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise GknetError(f"{source}: not valid TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise GknetError(f"{source}: {place}: {first['msg']}") from error
+
+
 def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ") + '"'
+    """A TOML basic string: JSON's escapes are among TOML's, and the delete character must be escaped too."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def spacecraft_toml(spacecraft: Spacecraft) -> str:

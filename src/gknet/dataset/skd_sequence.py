@@ -1,0 +1,169 @@
+"""One SKD sequence as it lies on disk: the rows of its table, its camera matrix, keypoints and skeleton."""
+
+from __future__ import annotations
+
+import csv
+import json
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_matrix, from_skd_points
+from gknet.errors import GknetError, MissingExtraError
+
+
+@dataclass(frozen=True, eq=False)
+class SkdSequence:
+    """`rows` are the cells as text, parsed when a frame is asked for; `indices` their frames, from 0.
+
+    name           as in the split files: data/000001
+    camera_matrix  (3, 3) K in our axes, of the whole sensor
+    points_m       (n, 3) keypoints in our body axes
+    """
+
+    name: str
+    folder: Path
+    category: str
+    rows: tuple[dict[str, str], ...]
+    indices: tuple[int, ...]
+    camera_matrix: Float[ndarray, "3 3"]
+    points_m: Float[ndarray, "n 3"]
+
+    def image_path(self, index: int) -> Path:
+        return self.folder / "image" / f"{frame_stem(index)}.jpg"
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    keypoint_names: tuple[str, ...]
+    edges: tuple[tuple[int, int], ...]
+
+
+def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
+    folder = root / name
+    rows = read_rows(folder / "annotations.csv")
+    own = folder / "camera_matrix.txt"
+    return SkdSequence(
+        name=name,
+        folder=folder,
+        category=category,
+        rows=rows,
+        indices=_indices(folder, rows),
+        camera_matrix=read_camera_matrix(own if own.exists() else root / "camera_matrix.txt"),
+        points_m=from_skd_points(read_table(folder / "keypoints.txt")),
+    )
+
+
+def read_rows(path: Path) -> tuple[dict[str, str], ...]:
+    """The rows of an annotations.csv as text, each with the authors' columns at least."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            rows = tuple(reader)
+            columns = reader.fieldnames or []
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise GknetError(f"{path}: cannot read the annotations ({error})") from error
+    missing = [column for column in AUTHORS_COLUMNS if column not in columns]
+    if missing:
+        raise GknetError(f"{path}: column '{missing[0]}' is missing; expected {', '.join(AUTHORS_COLUMNS)}")
+    for number, row in enumerate(rows, start=1):
+        if None in row or any(value is None for value in row.values()):
+            raise GknetError(
+                f"{path}: row {number}: expected {len(columns)} cells as in the header, got another number"
+            )
+    return rows
+
+
+def _indices(folder: Path, rows: tuple[dict[str, str], ...]) -> tuple[int, ...]:
+    """The frame of each row: its `frame` cell, else the image of the same rank."""
+    path = folder / "annotations.csv"
+    if rows and "frame" in rows[0]:
+        for number, row in enumerate(rows, start=1):
+            if not row["frame"].strip().isdecimal():
+                raise GknetError(f"{path}: row {number}: frame: expected 0, 1, ..., got {row['frame']!r}")
+        return tuple(int(row["frame"]) for row in rows)
+    stems = sorted(image.stem for image in (folder / "image").glob("*.jpg"))
+    if not stems:
+        return tuple(range(len(rows)))
+    if len(stems) != len(rows) or not all(stem.isdecimal() and int(stem) > 0 for stem in stems):
+        raise GknetError(f"{path}: {len(rows)} rows for {len(stems)} numbered images; add a column 'frame' (from 0)")
+    return tuple(int(stem) - 1 for stem in stems)
+
+
+def read_table(path: Path) -> Float[ndarray, "n 3"]:
+    """Rows of three finite numbers, separated by commas or spaces."""
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise GknetError(f"{path}: cannot read the table ({error})") from error
+    table = np.empty((len(lines), 3))
+    for number, line in enumerate(lines, start=1):
+        try:
+            values = [float(cell) for cell in line.replace(",", " ").split()]
+        except ValueError as error:
+            raise GknetError(f"{path}: row {number}: expected three numbers, got {line.strip()!r}") from error
+        if len(values) != 3 or not np.isfinite(values).all():
+            raise GknetError(f"{path}: row {number}: expected three finite numbers, got {line.strip()!r}")
+        table[number - 1] = values
+    return table
+
+
+def read_camera_matrix(path: Path) -> Float[ndarray, "3 3"]:
+    """K in our axes."""
+    stored = read_table(path)
+    if stored.shape != (3, 3):
+        raise GknetError(f"{path}: expected a 3 x 3 matrix, got {stored.shape[0]} x {stored.shape[1]}")
+    matrix = from_skd_matrix(stored)
+    if not np.allclose(matrix[2], (0, 0, 1)):
+        raise GknetError(f"{path}: expected SKD's order of axes, [[cx, fx, 0], [cy, 0, fy], [1, 0, 0]]")
+    return matrix
+
+
+def read_skeleton(folder: Path, keypoint_count: int) -> Skeleton:
+    """skeleton.json, else the authors' skeleton.pth, whose keypoints have no names."""
+    path = folder / "skeleton.json"
+    if path.exists():
+        return _read_json_skeleton(path, keypoint_count)
+    path = folder / "skeleton.pth"
+    if not path.exists():
+        raise GknetError(f"{folder}: expected skeleton.json or skeleton.pth, found neither")
+    names = tuple(f"keypoint_{k + 1:02d}" for k in range(keypoint_count))
+    return Skeleton(names, _edges(path, _read_torch_skeleton(path), keypoint_count))
+
+
+def _read_json_skeleton(path: Path, keypoint_count: int) -> Skeleton:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        names, edges = tuple(content["keypoint_names"]), content["edges"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GknetError(f"{path}: expected the keys keypoint_names and edges ({error!r})") from error
+    if len(names) != keypoint_count or not all(isinstance(name, str) for name in names):
+        raise GknetError(f"{path}: expected {keypoint_count} keypoint names as in keypoints.txt, got {len(names)}")
+    return Skeleton(names, _edges(path, edges, keypoint_count))
+
+
+def _read_torch_skeleton(path: Path) -> object:
+    try:
+        import torch
+    except ImportError as error:
+        raise MissingExtraError("train", "torch") from error
+    try:
+        return torch.load(path, weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise GknetError(f"{path}: cannot read the skeleton ({reason})") from error
+
+
+def _edges(path: Path, edges: object, keypoint_count: int) -> tuple[tuple[int, int], ...]:
+    try:
+        pairs = tuple((int(i), int(j)) for i, j in edges)  # type: ignore[attr-defined]
+    except (TypeError, ValueError) as error:
+        raise GknetError(f"{path}: expected a list of pairs of keypoint indices") from error
+    for i, j in pairs:
+        if not (0 <= i < keypoint_count and 0 <= j < keypoint_count and i != j):
+            raise GknetError(f"{path}: edge ({i}, {j}) is no pair of the keypoints 0 to {keypoint_count - 1}")
+    return pairs

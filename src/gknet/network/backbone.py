@@ -1,0 +1,141 @@
+"""What the networks share: a residual encoder, a feature pyramid, attention and the coding of positions."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+MEAN, SPREAD = 0.25, 0.25
+"""Centre and spread of the pixel values (0 to 1): space is dark, so both are low."""
+
+FREQUENCIES = (0.5, 1.0, 2.0, 4.0)
+POSITION_WIDTH = 4 * len(FREQUENCIES)
+
+
+def normalised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """Pixel values of 0 to 1 with about zero mean and unit spread."""
+    return (image - MEAN) / SPREAD
+
+
+def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
+    """Sines and cosines of the cell centres, in fractions of the map.
+
+    The same place of the picture has the same code at every resolution, so one network serves several input sizes.
+    """
+    y = (torch.arange(height, device=like.device, dtype=torch.float32) + 0.5) / height
+    x = (torch.arange(width, device=like.device, dtype=torch.float32) + 0.5) / width
+    frequency = torch.tensor(FREQUENCIES, device=like.device)[:, None] * (2 * math.pi)
+    along_x = torch.cat([torch.sin(frequency * x), torch.cos(frequency * x)])  # (c/2, width)
+    along_y = torch.cat([torch.sin(frequency * y), torch.cos(frequency * y)])  # (c/2, height)
+    wide = along_x[:, None, :].expand(-1, height, -1)
+    tall = along_y[:, :, None].expand(-1, -1, width)
+    return torch.cat([wide, tall])
+
+
+class ConvNorm(nn.Module):
+    """Convolution, batch normalisation and, unless `relu` is False, a ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, relu: bool = True) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+        self.norm: nn.Module = nn.BatchNorm2d(outputs)
+        self.relu = relu
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o hs ws"]:
+        x = self.norm(self.conv(x))
+        return functional.relu(x, inplace=True) if self.relu else x
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions around a shortcut (He et al. 2016)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = ConvNorm(inputs, outputs, 3, stride)
+        self.second = ConvNorm(outputs, outputs, 3, relu=False)
+        same = stride == 1 and inputs == outputs
+        self.shortcut = nn.Identity() if same else ConvNorm(inputs, outputs, 1, stride, relu=False)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o hs ws"]:
+        return functional.relu(self.second(self.first(x)) + self.shortcut(x), inplace=True)
+
+
+class Encoder(nn.Module):
+    """ResNet-18's shape at any width: five down-samplings, features at strides 4, 8, 16 and 32."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.widths = (width, 2 * width, 4 * width, 8 * width)
+        self.stem = ConvNorm(3, width, 7, 2)
+        self.pool = nn.MaxPool2d(3, 2, 1)
+        self.stages = nn.ModuleList()
+        inputs = width
+        for outputs in self.widths:
+            stride = 1 if outputs == width else 2
+            self.stages.append(nn.Sequential(ResidualBlock(inputs, outputs, stride), ResidualBlock(outputs, outputs, 1)))
+            inputs = outputs
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Tensor]:
+        """[(b, w, h/4, w/4), (b, 2w, h/8, ..), (b, 4w, h/16, ..), (b, 8w, h/32, ..)]"""
+        x = self.pool(self.stem(normalised(image)))
+        features = []
+        for stage in self.stages:
+            x = stage(x)
+            features.append(x)
+        return features
+
+
+class Pyramid(nn.Module):
+    """From the coarsest feature map up to stride 4, meeting the encoder's map at each level."""
+
+    def __init__(self, widths: tuple[int, ...], width: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList([nn.Conv2d(inputs, width, 1) for inputs in widths])
+        self.smooth = nn.ModuleList([ConvNorm(width, width, 3) for _ in widths[:-1]])
+
+    def forward(self, features: list[Tensor]) -> Float[Tensor, "b c h4 w4"]:
+        x = self.lateral[-1](features[-1])
+        for level in range(len(features) - 2, -1, -1):
+            x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
+            x = self.smooth[level](x + self.lateral[level](features[level]))
+        return x
+
+
+class Attention(nn.Module):
+    """Multi-head attention of `width` channels from queries to a memory."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, queries: Float[Tensor, "b q c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b q c"]:
+        batch, count, width = queries.shape
+        each = width // self.heads
+        query = self.query(queries).reshape(batch, count, self.heads, each).transpose(1, 2)
+        pair = self.key_value(memory).reshape(batch, memory.shape[1], 2, self.heads, each)
+        key, value = pair[:, :, 0].transpose(1, 2), pair[:, :, 1].transpose(1, 2)  # (b, heads, m, c/heads)
+        weight = (query @ key.transpose(2, 3) / math.sqrt(each)).softmax(dim=-1)
+        return self.out((weight @ value).transpose(1, 2).reshape(batch, count, width))
+
+
+class ContextBlock(nn.Module):
+    """A transformer layer over the cells of the coarsest map: every part of the craft hears of every other."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.before_attention = nn.LayerNorm(width)
+        self.attention = Attention(width, heads)
+        self.before_linear = nn.LayerNorm(width)
+        self.linear = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+
+    def forward(self, cells: Float[Tensor, "b m c"]) -> Float[Tensor, "b m c"]:
+        normal = self.before_attention(cells)
+        cells = cells + self.attention(normal, normal)
+        return cells + self.linear(self.before_linear(cells))

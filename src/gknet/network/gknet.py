@@ -1,0 +1,132 @@
+"""GKNet, small: a residual encoder, an up-sampling branch and a graph decoder whose nodes are keypoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gknet.errors import GknetError
+from gknet.network.backbone import POSITION_WIDTH, ContextBlock, ConvNorm, Encoder, Pyramid, position_code
+from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
+
+COARSEST = 32
+"""The encoder's last stride: an input side is a multiple of it."""
+
+
+@dataclass(frozen=True)
+class GKNetConfig:
+    """Sizes of the network.
+
+    width          channels of the encoder's first stage (ResNet-18 has 64)
+    pyramid_width  channels of the up-sampling branch
+    node_width     channels of a graph node and of the image cells that it attends to
+    node_layers    layers of the graph decoder
+    heads          attention heads
+    graph          "skeleton", "identity" (no edges, equal size) or "none" (no graph branch)
+    """
+
+    width: int = 32
+    pyramid_width: int = 64
+    node_width: int = 128
+    node_layers: int = 3
+    heads: int = 4
+    graph: str = "skeleton"
+
+    def __post_init__(self) -> None:
+        checked_graph(self.graph)
+        for name in ("width", "pyramid_width", "node_width", "node_layers", "heads"):
+            if getattr(self, name) < 1:
+                raise GknetError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.node_width % self.heads:
+            raise GknetError(f"node_width: expected a multiple of heads ({self.heads}), got {self.node_width}")
+
+
+class Branches(NamedTuple):
+    """The answer and its two parts. `nodes` is None without a graph branch."""
+
+    heatmaps: Tensor
+    pixels: Tensor
+    nodes: Tensor | None
+
+
+def check_input(image: Tensor) -> None:
+    if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % COARSEST or image.shape[3] % COARSEST:
+        raise GknetError(
+            f"network input: expected (b, 3, h, w) with h and w multiples of {COARSEST}, got {tuple(image.shape)}"
+        )
+
+
+class GKNet(nn.Module):
+    """Image -> one heatmap per keypoint, peak near 1, at a quarter of the input's resolution."""
+
+    stride = 4
+    input_size = 256
+
+    def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"]) -> None:
+        super().__init__()
+        self.config = config
+        keypoints = len(adjacency)
+        self.encoder = Encoder(config.width)
+        widths = self.encoder.widths
+        self.position = nn.Linear(POSITION_WIDTH, config.node_width)
+        self.coarse_cells = nn.Conv2d(widths[3], config.node_width, 1)
+        self.context = ContextBlock(config.node_width, config.heads)
+        self.pyramid = Pyramid((*widths[:3], widths[3] + config.node_width), config.pyramid_width)
+        self.pixel_head = nn.Conv2d(config.pyramid_width, keypoints, 1)
+        nn.init.normal_(self.pixel_head.weight, std=0.01)
+        nn.init.zeros_(self.pixel_head.bias)  # type: ignore[arg-type]
+        self.decoder: GraphDecoder | None = None
+        if config.graph != "none":
+            self._build_graph_branch(adjacency)
+
+    def _build_graph_branch(self, adjacency: Bool[ndarray, "n n"]) -> None:
+        config = self.config
+        edges = normalised_adjacency(adjacency, checked_graph(config.graph))
+        self.fine_cells = nn.Conv2d(self.encoder.widths[2], config.node_width, 1)
+        self.decoder = GraphDecoder(edges, config.node_width, config.node_width, config.heads, config.node_layers)
+        self.pixel_position = nn.Linear(POSITION_WIDTH, config.pyramid_width)
+        self.pixel_features = ConvNorm(config.pyramid_width, config.pyramid_width, 1, relu=False)
+        self.node_filter = nn.Linear(config.node_width, config.pyramid_width + 1)
+        nn.init.normal_(self.node_filter.weight, std=1e-3)  # the graph's maps start near zero, yet learn at once
+        nn.init.zeros_(self.node_filter.bias)
+        self.fusion = Fusion(len(adjacency))
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h4 w4"]:
+        """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
+        return self.branches(image).heatmaps
+
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+        """The heatmaps and what each branch contributed, for a loss on both."""
+        check_input(image)
+        features = self.encoder(image)
+        coarse = features[3]
+        cells = self.context(self._cells(self.coarse_cells(coarse)))  # (b, hw/1024, c)
+        context = cells.transpose(1, 2).reshape(coarse.shape[0], -1, coarse.shape[2], coarse.shape[3])
+        up = self.pyramid([*features[:3], torch.cat([coarse, context.to(coarse.dtype)], dim=1)])
+        pixels = self.pixel_head(up)  # eq. 1
+        if self.decoder is None:
+            return Branches(pixels, pixels, None)
+        memory = torch.cat([cells, self._cells(self.fine_cells(features[2]))], dim=1)
+        nodes = self._node_maps(self.decoder(memory), up)
+        return Branches(self.fusion(pixels, nodes), pixels, nodes)
+
+    def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
+        """A map as a list of cells that know where they are."""
+        code = position_code(features.shape[2], features.shape[3], features).flatten(1).T
+        return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
+
+    def _node_maps(self, nodes: Float[Tensor, "b n c"], up: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
+        """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is."""
+        batch, _, height, width = up.shape
+        code = position_code(height, width, up).flatten(1).T
+        cells = self.pixel_features(up).permute(0, 2, 3, 1).flatten(1, 2)  # (b, hw, p)
+        cells = functional.relu(cells + self.pixel_position(code))
+        filters = self.node_filter(nodes)  # (b, n, p + 1), the last one a bias
+        maps = cells @ filters[:, :, :-1].transpose(1, 2) + filters[:, None, :, -1]  # (b, hw, n)
+        return maps.reshape(batch, height, width, -1).permute(0, 3, 1, 2)

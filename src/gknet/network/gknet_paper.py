@@ -1,0 +1,100 @@
+"""GKNet at the paper's own sizes: a U-Net of base width 64 decoded to full size, 32x32 heatmaps.
+
+Where the paper is silent we chose: channels 64 to 1024 with two 3x3 convolutions a level, skips at every level, an
+8x8 convolution of stride 8 from F' to F'', three graph layers of 512 channels, and C_out = H W, so that a node's
+output is its keypoint's map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gknet.network.backbone import POSITION_WIDTH, ConvNorm, normalised, position_code
+from gknet.network.gknet import Branches, check_input
+from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
+
+
+@dataclass(frozen=True)
+class GKNetPaperConfig:
+    """base: channels at full resolution; node_*, heads: of the graph decoder; graph: as in gknet-s."""
+
+    base: int = 64
+    node_width: int = 512
+    node_hidden: int = 1024
+    node_layers: int = 3
+    heads: int = 8
+    graph: str = "skeleton"
+
+    def __post_init__(self) -> None:
+        checked_graph(self.graph)
+
+
+def _level(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(ConvNorm(inputs, outputs), ConvNorm(outputs, outputs))
+
+
+class GKNetPaper(nn.Module):
+    """Image -> one heatmap per keypoint at an eighth of the input's resolution: 256 -> 32."""
+
+    stride = 8
+    input_size = 256
+
+    def __init__(self, config: GKNetPaperConfig, adjacency: Bool[ndarray, "n n"]) -> None:
+        super().__init__()
+        self.config = config
+        keypoints = len(adjacency)
+        widths = [config.base * factor for factor in (1, 2, 4, 8, 16, 16)]
+        self.down = nn.ModuleList([_level(i, o) for i, o in zip([3, *widths[:-1]], widths, strict=True)])
+        self.up = nn.ModuleList(
+            [_level(below + skip, skip) for below, skip in zip(widths[:0:-1], widths[-2::-1], strict=True)]
+        )
+        self.pixel_head = nn.Conv2d(widths[0], keypoints, self.stride, self.stride)
+        nn.init.normal_(self.pixel_head.weight, std=1e-3)
+        self.decoder: GraphDecoder | None = None
+        if config.graph != "none":
+            edges = normalised_adjacency(adjacency, checked_graph(config.graph))
+            width = config.node_width
+            self.cells = nn.Conv2d(widths[-1], width, 1)
+            self.position = nn.Linear(POSITION_WIDTH, width)
+            self.decoder = GraphDecoder(edges, width, config.node_hidden, config.heads, config.node_layers)
+            self.map_side = self.input_size // self.stride
+            self.node_map = nn.Linear(width, self.map_side**2)
+            nn.init.normal_(self.node_map.weight, std=1e-4)
+            self.fusion = Fusion(keypoints)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h8 w8"]:
+        """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
+        return self.branches(image).heatmaps
+
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+        check_input(image)
+        x = normalised(image)
+        skips = []
+        for level, block in enumerate(self.down):
+            x = block(functional.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        coarse = skips.pop()  # F, stride 32
+        x = coarse
+        for block, skip in zip(self.up, reversed(skips), strict=True):
+            x = block(torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), skip], dim=1))
+        pixels = self.pixel_head(x)  # eq. 1
+        if self.decoder is None:
+            return Branches(pixels, pixels, None)
+        nodes = self._node_maps(coarse, pixels)
+        return Branches(self.fusion(pixels, nodes), pixels, nodes)
+
+    def _node_maps(self, coarse: Float[Tensor, "b c h w"], pixels: Tensor) -> Float[Tensor, "b n h8 w8"]:
+        assert self.decoder is not None
+        code = position_code(coarse.shape[2], coarse.shape[3], coarse).flatten(1).T
+        memory = self.cells(coarse).permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
+        maps = self.node_map(self.decoder(memory))
+        maps = maps.reshape(maps.shape[0], -1, self.map_side, self.map_side)
+        if maps.shape[2:] == pixels.shape[2:]:
+            return maps
+        return functional.interpolate(maps, size=pixels.shape[2:], mode="bilinear")

@@ -1,0 +1,108 @@
+"""The graph decoder: a node is a keypoint, an edge is a pair of the spacecraft's skeleton."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gknet.errors import GknetError
+from gknet.network.backbone import Attention
+
+Graph = Literal["skeleton", "identity", "none"]
+
+
+def checked_graph(graph: str) -> Graph:
+    if graph not in get_args(Graph):
+        raise GknetError(f"graph: expected one of {', '.join(get_args(Graph))}, got '{graph}'")
+    return graph  # type: ignore[return-value]
+
+
+def normalised_adjacency(adjacency: Bool[ndarray, "n n"], graph: Graph = "skeleton") -> Float[Tensor, "n n"]:
+    """D^-1/2 A D^-1/2 of the binary, symmetric A with ones on its diagonal (eq. 3).
+
+    `identity` forgets the edges: nodes keep their layers and do not mix, which is the ablation at equal size.
+    """
+    matrix = np.asarray(adjacency, dtype=np.float64)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise GknetError(f"adjacency: expected a square matrix, got shape {matrix.shape}")
+    if not (np.isin(matrix, (0, 1)).all() and (matrix == matrix.T).all() and (matrix.diagonal() == 1).all()):
+        raise GknetError("adjacency: expected zeros and ones, symmetric, with ones on the diagonal")
+    if graph == "identity":
+        matrix = np.eye(len(matrix))
+    root = 1 / np.sqrt(matrix.sum(axis=1))
+    return torch.from_numpy(root[:, None] * matrix * root[None, :]).float()
+
+
+class GraphConvolution(nn.Module):
+    """sigma(W F A~) of eq. 2 and the linear layer behind it that keeps nodes apart (GraphCape)."""
+
+    adjacency: Tensor
+
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int) -> None:
+        super().__init__()
+        self.mix = nn.Linear(width, hidden)
+        self.linear = nn.Linear(hidden, width)
+        # The skeleton belongs to the spacecraft, not to the weights: it is rebuilt, never loaded.
+        self.register_buffer("adjacency", adjacency, persistent=False)
+
+    def forward(self, nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
+        mixed = self.mix(nodes)
+        return self.linear(functional.relu(self.adjacency.to(mixed.dtype) @ mixed))  # eq. 2, nodes as rows
+
+
+class GraphLayer(nn.Module):
+    """Nodes look at the picture, at each other, and along the edges; each with a residual and a LayerNorm."""
+
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.look = Attention(width, heads)
+        self.after_look = nn.LayerNorm(width)
+        self.share = Attention(width, heads)
+        self.after_share = nn.LayerNorm(width)
+        self.graph = GraphConvolution(adjacency, width, hidden)
+        self.after_graph = nn.LayerNorm(width)
+
+    def forward(self, nodes: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+        nodes = self.after_look(nodes + self.look(nodes, memory))
+        nodes = self.after_share(nodes + self.share(nodes, nodes))
+        return self.after_graph(nodes + self.graph(nodes))
+
+
+class GraphDecoder(nn.Module):
+    """One learned query per keypoint becomes that keypoint's node; any number of keypoints."""
+
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, layers: int) -> None:
+        super().__init__()
+        self.queries = nn.Parameter(torch.randn(len(adjacency), width) * 0.5)
+        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads) for _ in range(layers)])
+
+    def forward(self, memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+        nodes = self.queries.expand(memory.shape[0], -1, -1)
+        for layer in self.layers:
+            nodes = layer(nodes, memory)
+        return nodes
+
+
+class Fusion(nn.Module):
+    """The maps of both branches, joined by a 1x1 convolution.
+
+    Their product comes along, so that a node can veto a twin's peak. At the start the output is the up-sampling
+    branch's map plus the node's map, keypoint by keypoint: neither branch starves the other.
+    """
+
+    def __init__(self, keypoints: int) -> None:
+        super().__init__()
+        self.join = nn.Conv2d(3 * keypoints, keypoints, 1)
+        one = torch.eye(keypoints)
+        with torch.no_grad():
+            self.join.weight.copy_(torch.cat([one, one, 0 * one], dim=1)[:, :, None, None])
+            nn.init.zeros_(self.join.bias)  # type: ignore[arg-type]
+
+    def forward(self, pixels: Float[Tensor, "b n h w"], nodes: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"]:
+        return self.join(torch.cat([pixels, nodes, pixels * nodes], dim=1))

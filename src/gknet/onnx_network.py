@@ -1,0 +1,99 @@
+"""An exported network: one .onnx file, run by onnxruntime, with what is needed to use it in its metadata."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import onnxruntime
+from jaxtyping import Float32
+from numpy import ndarray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from gknet.errors import GknetError
+from gknet.spacecraft import Spacecraft, spacecraft_from_toml
+
+METADATA_KEY = "gknet"
+
+PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+
+
+class Metadata(BaseModel):
+    """What the export wrote under the key "gknet", as JSON.
+
+    spacecraft        the text of the spacecraft's .toml: channel k of a keypoint network is its keypoint k
+    stride            input pixels per cell of the output
+    tolerance         the largest difference from the trained network that the export allowed
+    covariance_scale  of the decoded keypoints, from the validation split
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    kind: Literal["keypoints", "locator"]
+    version: str
+    network: str
+    spacecraft: str
+    stride: int = Field(gt=0)
+    input_size: int = Field(gt=0)
+    tolerance: FiniteFloat
+    covariance_scale: FiniteFloat = Field(default=1.0, gt=0)
+
+
+class OnnxNetwork:
+    """A callable (b, 3, size, size) float32 RGB in [0, 1] -> (b, c, size / stride, size / stride).
+
+    threads   of one call; None leaves the choice to onnxruntime (every core)
+    device    "cpu", or "cuda" with the package onnxruntime-gpu
+    """
+
+    def __init__(self, path: str | Path, threads: int | None = None, device: str = "cpu") -> None:
+        self.path = Path(path)
+        self._session = _open(self.path, threads, device)
+        self._input = self._session.get_inputs()[0].name
+        text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        self.metadata = _read_metadata(self.path, text)
+
+    @cached_property
+    def spacecraft(self) -> Spacecraft:
+        return spacecraft_from_toml(self.metadata.spacecraft, str(self.path))
+
+    def __call__(self, images: Float32[ndarray, "b 3 size size"]) -> Float32[ndarray, "b c cells cells"]:
+        size = self.metadata.input_size
+        if images.ndim != 4 or images.shape[1:] != (3, size, size) or images.dtype != np.float32:
+            raise GknetError(
+                f"{self.path.name}: expected float32 images of shape (b, 3, {size}, {size}), "
+                f"got {images.dtype} of {images.shape}"
+            )
+        return self._session.run(None, {self._input: images})[0]
+
+
+def _open(path: Path, threads: int | None, device: str) -> onnxruntime.InferenceSession:
+    if device not in PROVIDERS:
+        raise GknetError(f"device: expected one of {', '.join(PROVIDERS)}, got '{device}'")
+    if PROVIDERS[device] not in onnxruntime.get_available_providers():
+        raise GknetError(f"device {device}: this onnxruntime cannot use it; install onnxruntime-gpu")
+    if threads is not None and threads < 1:
+        raise GknetError(f"threads: expected 1 or more, got {threads}")
+    if not path.is_file():
+        raise GknetError(f"{path}: no such model file")
+    options = onnxruntime.SessionOptions()
+    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = threads or 0
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=[PROVIDERS[device]])
+    except Exception as error:  # onnxruntime's exceptions have no common base
+        raise GknetError(f"{path}: not a model that onnxruntime can open ({str(error).splitlines()[0]})") from error
+
+
+def _read_metadata(path: Path, text: str | None) -> Metadata:
+    if text is None:
+        raise GknetError(f"{path}: no '{METADATA_KEY}' metadata; expected a file written by 'gknet export'")
+    try:
+        return Metadata.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "JSON"
+        raise GknetError(f"{path}: metadata: {place}: {first['msg']}") from error

@@ -1,0 +1,235 @@
+"""Keypoints to a pose with its covariance: PoseLib's LO-RANSAC, then a robust refinement whitened by covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import poselib
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from gknet.errors import GknetError
+from gknet.frame import Keypoints
+from gknet.geometry import Camera, Pose
+
+ROBUST_SIGMAS = 3.0
+"""Beyond this many of its own sigmas a keypoint loses weight."""
+
+ITERATIONS = 20
+
+
+@dataclass(frozen=True)
+class PnpSettings:
+    """When a pose is believed. Pixels here are those of the network's input; `solve_pnp` is told their size.
+
+    min_score        keypoints below are not used
+    threshold_px     a keypoint nearer than this to its projection is an inlier; tried in order until a pose comes
+    min_inliers      and at least this fraction of the keypoints used
+    max_rms_px       of the inliers' reprojection errors
+    """
+
+    min_score: float = 0.15
+    threshold_px: tuple[float, ...] = (5.0, 12.0)
+    min_inliers: int = 5
+    min_inlier_fraction: float = 0.3
+    max_rms_px: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not self.threshold_px or min(self.threshold_px) <= 0:
+            raise GknetError(f"pnp: expected positive thresholds, got {self.threshold_px}")
+
+
+@dataclass(frozen=True, eq=False)
+class PnpResult:
+    """A pose, its (6, 6) covariance as `Estimate` states it, the (n,) inliers and their rms in image pixels."""
+
+    cam_from_body: Pose
+    covariance: Float[ndarray, "6 6"]
+    inliers: Bool[ndarray, "n"]
+    reprojection_rms_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The usable keypoints, measured in (possibly distorted) image pixels."""
+
+    pixels: Float[ndarray, "k 2"]
+    information: Float[ndarray, "k 2 2"]
+    points_m: Float[ndarray, "k 3"]
+    camera: Camera
+
+
+def solve_pnp(
+    keypoints: Keypoints,
+    camera: Camera,
+    points_m: Float[ndarray, "n 3"],
+    input_px: float = 1.0,
+    settings: PnpSettings | None = None,
+) -> PnpResult | str:
+    """The pose that explains the keypoints, or the reason why there is none.
+
+    input_px   size of one pixel of the network's input in image pixels (1 / Crop.scale)
+    The same input gives the same bits: the sampling has a fixed seed.
+    """
+    settings = settings or PnpSettings()
+    if len(points_m) != len(keypoints.score):
+        raise GknetError(f"pnp: expected {len(points_m)} keypoints, one for each point, got {len(keypoints.score)}")
+    usable = _usable(keypoints, settings.min_score)
+    if usable.sum() < 4:
+        return f"only {usable.sum()} keypoints are sure enough, a pose needs 4"
+    problem = _Problem(
+        keypoints.pixels[usable], np.linalg.inv(keypoints.covariance_px2[usable]), points_m[usable], camera
+    )
+    result: PnpResult | str = "no keypoint threshold was tried"
+    for threshold in settings.threshold_px:
+        result = _solve(problem, keypoints.score[usable], threshold * input_px, input_px, settings)
+        if isinstance(result, PnpResult):
+            inliers = np.zeros(len(usable), dtype=bool)
+            inliers[usable] = result.inliers
+            return PnpResult(result.cam_from_body, result.covariance, inliers, result.reprojection_rms_px)
+    return result
+
+
+def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, "n"]:
+    finite = np.isfinite(keypoints.pixels).all(axis=1) & np.isfinite(keypoints.covariance_px2).all(axis=(1, 2))
+    return (
+        finite
+        & (keypoints.score >= min_score)
+        & (np.linalg.det(np.where(finite[:, None, None], keypoints.covariance_px2, 0.0)) > 0)
+    )
+
+
+def _solve(
+    problem: _Problem, score: Float[ndarray, "k"], threshold_px: float, input_px: float, settings: PnpSettings
+) -> PnpResult | str:
+    """One round: consensus, refinement, then every reason to disbelieve it."""
+    start = _consensus(problem, score, threshold_px)
+    if start is None:
+        return "no pose agrees with enough keypoints"
+    near = _residuals_px(problem, start) < 2 * threshold_px
+    pose = _refine(problem, start, near)
+    error = _residuals_px(problem, pose)
+    inliers = error < threshold_px
+    needed = max(min(settings.min_inliers, len(score)), int(np.ceil(settings.min_inlier_fraction * len(score))))
+    if inliers.sum() < needed:
+        return f"only {inliers.sum()} of {len(score)} keypoints agree with one pose, expected {needed}"
+    if (pose.transform(problem.points_m)[inliers, 2] <= 0).any():
+        return "the pose puts the spacecraft behind the camera"
+    rms = float(np.sqrt((error[inliers] ** 2).mean()))
+    if rms > settings.max_rms_px * input_px:
+        return f"the keypoints miss the pose by {rms:.1f} px rms"
+    covariance = _covariance(problem, pose, inliers)
+    if covariance is None:
+        return "the keypoints do not fix the pose (they lie on a line)"
+    return PnpResult(pose, covariance, inliers, rms)
+
+
+def _consensus(problem: _Problem, score: Float[ndarray, "k"], threshold_px: float) -> Pose | None:
+    """LO-RANSAC on undistorted pixels, the surest keypoints first."""
+    matrix = problem.camera.matrix
+    order = np.argsort(-score, kind="stable")
+    found, report = poselib.estimate_absolute_pose(
+        problem.camera.undistort(problem.pixels)[order],
+        problem.points_m[order],
+        {
+            "model": "PINHOLE",
+            "width": problem.camera.width,
+            "height": problem.camera.height,
+            "params": [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]],
+        },
+        {"max_reproj_error": threshold_px, "max_iterations": 1000, "min_iterations": 50, "seed": 0},
+        {"loss_type": "CAUCHY", "loss_scale": threshold_px / 3},
+    )
+    if report["num_inliers"] < 4 or not np.isfinite(found.t).all() or not np.isfinite(found.R).all():
+        return None
+    return Pose(_orthonormal(found.R), found.t)
+
+
+def _orthonormal(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
+    return Rotation.from_matrix(rotation).as_matrix()
+
+
+def _residuals_px(problem: _Problem, pose: Pose) -> Float[ndarray, "k"]:
+    """Distance from each keypoint to its projection; infinite behind the camera."""
+    distance = np.linalg.norm(problem.camera.project(pose.transform(problem.points_m)) - problem.pixels, axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def _linearise(problem: _Problem, pose: Pose) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 6"]]:
+    """Measured minus projected pixels, and the projection's derivative by (dw, dt): exp([dw]x) R, t + dt."""
+    turned = problem.points_m @ pose.rotation.T
+    projected, derivatives = cv2.projectPoints(
+        turned + pose.translation_m, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
+    )
+    by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
+    by_turn = np.cross(turned[:, None], by_point)  # a . (dw x p) = dw . (p x a)
+    return problem.pixels - projected[:, 0], np.concatenate([by_turn, by_point], axis=2)
+
+
+def _moved(pose: Pose, step: Float[ndarray, "6"]) -> Pose:
+    rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation
+    return Pose(_orthonormal(rotation), pose.translation_m + step[3:])
+
+
+def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
+    """Levenberg-Marquardt on Cauchy's loss of the whitened errors of the keypoints in `use`."""
+    residual, jacobian = _linearise(problem, pose)
+    cost, weight = _cauchy(residual, problem.information, use)
+    damping = 1e-4
+    for _ in range(ITERATIONS):
+        weighted = jacobian.transpose(0, 2, 1) @ (problem.information * weight[:, None, None])
+        normal = (weighted @ jacobian).sum(axis=0)
+        gradient = (weighted @ residual[..., None]).sum(axis=0)[:, 0]
+        scale = np.sqrt(np.diag(normal)) + 1e-12
+        damped = normal / np.outer(scale, scale) + damping * np.eye(6)
+        step = np.linalg.solve(damped, gradient / scale) / scale
+        trial = _moved(pose, step)
+        if (trial.transform(problem.points_m)[use, 2] <= 0).any():
+            damping *= 10
+            continue
+        trial_residual, trial_jacobian = _linearise(problem, trial)
+        trial_cost, trial_weight = _cauchy(trial_residual, problem.information, use)
+        if trial_cost > cost:
+            damping *= 10
+            continue
+        settled = cost - trial_cost < 1e-9 * max(cost, 1e-12)
+        pose, residual, jacobian, cost, weight = trial, trial_residual, trial_jacobian, trial_cost, trial_weight
+        damping *= 0.1
+        if settled:
+            break
+    return pose
+
+
+def _mahalanobis2(residual: Float[ndarray, "k 2"], information: Float[ndarray, "k 2 2"]) -> Float[ndarray, "k"]:
+    return np.einsum("ki,kij,kj->k", residual, information, residual)
+
+
+def _cauchy(
+    residual: Float[ndarray, "k 2"], information: Float[ndarray, "k 2 2"], use: Bool[ndarray, "k"]
+) -> tuple[float, Float[ndarray, "k"]]:
+    """Cost and weights of Cauchy's loss; keypoints outside `use` count nothing."""
+    ratio = _mahalanobis2(residual, information) / ROBUST_SIGMAS**2
+    return float(np.log1p(ratio[use]).sum()), np.where(use, 1 / (1 + ratio), 0.0)
+
+
+def _covariance(problem: _Problem, pose: Pose, inliers: Bool[ndarray, "k"]) -> Float[ndarray, "6 6"] | None:
+    """(J^T W J)^-1 of the inliers, or None when it has no inverse.
+
+    A keypoint off by more than ROBUST_SIGMAS of its sigmas has W scaled down until it is off by just that many.
+    """
+    residual, jacobian = _linearise(problem, pose)
+    off = _mahalanobis2(residual, problem.information)
+    weight = np.where(inliers, np.minimum(1.0, ROBUST_SIGMAS**2 / np.maximum(off, 1e-12)), 0.0)
+    information = problem.information * weight[:, None, None]
+    normal = (jacobian.transpose(0, 2, 1) @ information @ jacobian).sum(axis=0)
+    scale = np.sqrt(np.diag(normal))
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        return None
+    unit = normal / np.outer(scale, scale)
+    if np.linalg.cond(unit) > 1e12:
+        return None
+    covariance = np.linalg.inv(unit) / np.outer(scale, scale)
+    return (covariance + covariance.T) / 2

@@ -1,0 +1,211 @@
+"""A spacecraft in Mitsuba 3: radiance, and labels from the same geometry.
+
+Mitsuba's world is the body frame: the geometry stands still, camera and lights move about it, and nothing is loaded or
+compiled again from frame to frame. Radiance 1.0 is a white Lambertian surface that faces the full sun.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
+from scipy.spatial import ConvexHull, QhullError
+
+from gknet.crop import Crop
+from gknet.errors import GknetError, MissingExtraError
+from gknet.geometry import Camera, Pose
+from gknet.render import film, shading
+from gknet.render.materials import build_shapes, read_glb
+from gknet.render.shading import Light, Region
+from gknet.spacecraft import Spacecraft
+
+if TYPE_CHECKING:
+    from gknet.render.scenario import Shot
+
+VARIANT_VARIABLE = "GKNET_MITSUBA_VARIANT"
+EARTH_RADIUS_M = 6.371e6
+EARTH_ALBEDO = (0.27, 0.30, 0.34)
+STARLIGHT = 0.002
+"""Radiance from every direction, so that no shadow is perfectly black."""
+
+OCCLUSION_TOLERANCE = 0.002
+"""A keypoint is hidden by what is nearer than it by more than this part of the diameter (1 cm on 5 m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """The spacecraft alone in a square window of `s` pixels.
+
+    radiance  linear RGB, premultiplied by alpha (black where there is no spacecraft)
+    alpha     part of the pixel that the spacecraft covers
+    mask      the ray of the pixel's centre meets the spacecraft
+    depth_m   z of that point in the camera frame, 0 outside the mask
+    visible   per keypoint: in front, inside the full image, nothing before it
+    """
+
+    radiance: Float32[ndarray, "s s 3"]
+    alpha: Float32[ndarray, "s s"]
+    mask: Bool[ndarray, "s s"]
+    depth_m: Float32[ndarray, "s s"]
+    visible: Bool[ndarray, "n"]
+
+
+@functools.cache
+def choose_variant() -> str:
+    """Mitsuba's variant for this machine: $GKNET_MITSUBA_VARIANT, else LLVM when it works, else scalar_rgb.
+
+    LLVM is tried in a process of its own, since a version that does not fit aborts the process.
+    """
+    chosen = os.environ.get(VARIANT_VARIABLE)
+    if chosen:
+        return chosen
+    if _works("llvm_ad_rgb"):
+        return "llvm_ad_rgb"
+    warnings.warn(
+        "rendering with scalar_rgb, many times slower: Mitsuba found no LLVM that works; "
+        "install one (Debian, Ubuntu: apt install libllvm19 or libllvm15)",
+        stacklevel=2,
+    )
+    return "scalar_rgb"
+
+
+def _works(variant: str) -> bool:
+    program = (
+        f"import mitsuba as mi; mi.set_variant({variant!r}); import drjit as dr\n"
+        "dr.eval(mi.render(mi.load_dict({'type': 'scene', 'ball': {'type': 'sphere'}, 'eye': {'type': 'perspective', "
+        "'film': {'type': 'hdrfilm', 'width': 8, 'height': 8}}, 'sky': {'type': 'constant'}}), spp=1)); dr.sync_thread()"
+    )
+    try:
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=120, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0
+
+
+def _mitsuba(variant: str) -> ModuleType:
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise MissingExtraError("render", "mitsuba") from error
+    if variant not in mi.variants() or not variant.endswith("_rgb"):
+        known = ", ".join(name for name in mi.variants() if name.endswith("_rgb"))
+        raise GknetError(f"variant: expected one of {known}, got '{variant}'")
+    if mi.variant() != variant:
+        try:
+            mi.set_variant(variant)
+        except (ImportError, RuntimeError) as error:
+            raise GknetError(f"variant: Mitsuba cannot run '{variant}' here ({error}); try scalar_rgb") from error
+    return mi
+
+
+class Renderer:
+    """One spacecraft, loaded once, rendered from any pose.
+
+    variant   of Mitsuba, None for `choose_variant()`: llvm_ad_rgb, scalar_rgb, or cuda_ad_rgb (by its looks the same
+              as LLVM, but never tried)
+    spp       samples a pixel
+    threads   of this process, None for all cores
+    """
+
+    def __init__(
+        self, spacecraft: Spacecraft, variant: str | None = None, spp: int = 8, threads: int | None = None
+    ) -> None:
+        if spp < 1 or (threads is not None and threads < 1):
+            raise GknetError(f"renderer: expected a positive spp and number of threads, got {spp} and {threads}")
+        if spacecraft.mesh_path is None:
+            raise GknetError(f"{spacecraft.name}: it has no mesh to render; build one with `gknet fleet FOLDER`")
+        surfaces = read_glb(spacecraft.mesh_path)
+        self.spacecraft = spacecraft
+        self.variant = variant or choose_variant()
+        self.spp = spp
+        mi = _mitsuba(self.variant)
+        if threads is not None:
+            import drjit
+
+            drjit.set_thread_count(threads)
+        self._hull_m = _hull(np.concatenate([surface.vertices_m for surface in surfaces]))
+        self._shapes = build_shapes(mi, surfaces)
+        self._scene = mi.load_dict({"type": "scene", **self._shapes})
+
+    def render(self, shot: Shot, window: Crop) -> Rendered:
+        """The spacecraft in `window` of the shot's camera; the same shot gives the same bits."""
+        mi = _mitsuba(self.variant)
+        camera = shot.camera.warped(window.input_from_image, window.size, window.size)
+        _check_square(camera)
+        rgba, depth = self._picture(mi, shot, camera)
+        points_cam = shot.cam_from_body.transform(self.spacecraft.points_m)
+        visible = shot.camera.contains(shot.camera.project(points_cam))
+        tolerance = OCCLUSION_TOLERANCE * self.spacecraft.diameter_m
+        unhidden = film.unhidden if self.variant.startswith("scalar") else shading.unhidden
+        visible &= unhidden(mi, self._scene, shot.cam_from_body.inverse(), points_cam, tolerance)
+        return Rendered(rgba[..., :3], rgba[..., 3], depth > 0, depth, visible)
+
+    def _picture(
+        self, mi: ModuleType, shot: Shot, camera: Camera
+    ) -> tuple[Float32[ndarray, "s s 4"], Float32[ndarray, "s s"]]:
+        body_from_cam, light = shot.cam_from_body.inverse(), light_of(shot)
+        if self.variant.startswith("scalar"):
+            sensor = film.sensor(mi, camera, body_from_cam)
+            rgba = film.radiance(mi, self._shapes, sensor, light, self.spp, shot.seed)
+            return rgba, film.depth(mi, self._scene, sensor, body_from_cam)
+        rgba = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
+        depth = np.zeros((camera.height, camera.width), dtype=np.float32)
+        region = region_of(camera, shot.cam_from_body.transform(self._hull_m))
+        if region is not None:
+            rows, columns = region.slices
+            rgba[rows, columns] = shading.radiance(
+                mi, self._scene, camera, body_from_cam, region, light, self.spp, shot.seed
+            )
+            depth[rows, columns] = shading.depth(mi, self._scene, camera, body_from_cam, region)
+        return rgba, depth
+
+
+def light_of(shot: Shot) -> Light:
+    """The sun, the Earth and a faint sky as the spacecraft of a shot meets them, in its body frame."""
+    rotation = shot.cam_from_body.rotation
+    sun = np.asarray(shot.sun_direction, dtype=np.float64)
+    centre = None
+    if shot.earth is not None:
+        # The Earth is a sphere whose direction is the same for all parts of the spacecraft.
+        centre = (shot.earth.centre_cam_m - shot.cam_from_body.translation_m) @ rotation / EARTH_RADIUS_M
+        if centre @ centre <= 1:
+            raise GknetError(f"shot: the spacecraft is inside the Earth ({np.linalg.norm(centre):.4f} radii away)")
+    return Light(sun / np.linalg.norm(sun) @ rotation, STARLIGHT, EARTH_ALBEDO, centre)
+
+
+def region_of(camera: Camera, hull_cam_m: Float[ndarray, "v 3"]) -> Region | None:
+    """The part of a window that the convex hull of the mesh may cover, None when it is out of the picture."""
+    whole = Region(0, 0, camera.width, camera.height)
+    if (hull_cam_m[:, 2] <= 0).all():
+        return None
+    if (hull_cam_m[:, 2] < 1e-3 * np.abs(hull_cam_m).max()).any():
+        return whole
+    pixels = camera.project(hull_cam_m)
+    low = np.maximum(np.floor(pixels.min(axis=0)) - 1, 0).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0)) + 1, (camera.width, camera.height)).astype(int)
+    if (high <= low).any():
+        return None
+    return Region(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _hull(vertices_m: Float[ndarray, "v 3"]) -> Float[ndarray, "h 3"]:
+    """The corners of the convex hull, or all vertices of a flat mesh, which has none."""
+    try:
+        return vertices_m[ConvexHull(vertices_m).vertices]
+    except QhullError:
+        return vertices_m
+
+
+def _check_square(camera: Camera) -> None:
+    (fx, skew, _), (_, fy, _) = camera.matrix[:2]
+    if abs(skew) > 1e-6 * fx or abs(fx - fy) > 1e-6 * fx:
+        raise GknetError(f"camera: the renderer needs square pixels without skew, got fx {fx}, fy {fy}, skew {skew}")

@@ -1,0 +1,303 @@
+"""The rendering stage: what is planned, what is written, what a resumed job does. The pictures are made by stand-ins."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mitsuba")
+
+from gknet import fleet
+from gknet.crop import Crop
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.frame import Box
+from gknet.geometry import Pose
+from gknet.image import read_image, read_mask
+from gknet.render import generate as stage
+from gknet.render import worker
+from gknet.render.plan import FILM_SIZES, Options, Selection, parse_shard, plan_sequences, target_window
+from gknet.render.recipe import Recipe, load_recipe
+from gknet.render.scenario import CAMERA, Sensor, Shot
+from gknet.render.scene import Rendered
+from gknet.spacecraft import Spacecraft, save_spacecraft
+
+POINTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.5], [0, 0, 1]])
+SENSOR = Sensor(
+    psf_sigma_px=0.6,
+    exposure=1.0,
+    full_well_e=20000,
+    read_noise_e=10,
+    bloom=0.0,
+    veil=0.0,
+    gamma=1.0,
+    monochrome=False,
+    jpeg_quality=95,
+)
+
+
+def recipe(sequences: int = 15, frames: int = 6) -> Recipe:
+    return load_recipe("skd").model_copy(update={"sequences": sequences, "frames": frames})
+
+
+def shot_of(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, index: int) -> Shot:
+    """The craft unturned, 20 m away, moving to the right by 2 m a frame."""
+    return Shot(
+        recipe=recipe.name,
+        spacecraft=spacecraft.name,
+        sequence=sequence,
+        index=index,
+        time_s=float(index),
+        camera=CAMERA,
+        cam_from_body=Pose(np.eye(3), np.array([2.0 * index - 4, 0.5 * sequence - 2, 20.0])),
+        sun_direction=np.array([0.0, 0.0, -1.0]),
+        earth_direction=np.array([0.0, 1.0, 0.0]),
+        earth=None,
+        cam_from_inertial=np.eye(3),
+        sensor=SENSOR,
+        seed=1000 * sequence + index + seed,
+    )
+
+
+class PaintedRenderer:
+    """Stands in for Mitsuba: a white disc of 0.3 m at each keypoint, on a craft of which all is visible."""
+
+    def __init__(self, spacecraft: Spacecraft, variant: str, spp: int, threads: int | None) -> None:
+        self.spacecraft = spacecraft
+
+    def render(self, shot: Shot, window: Crop) -> Rendered:
+        camera = shot.camera.warped(window.input_from_image, window.size, window.size)
+        y, x = np.mgrid[: window.size, : window.size] + 0.5
+        mask = np.zeros((window.size, window.size), dtype=bool)
+        for px, py in camera.project(shot.cam_from_body.transform(self.spacecraft.points_m)):
+            mask |= np.hypot(x - px, y - py) < camera.matrix[0, 0] * 0.3 / 20
+        alpha = mask.astype(np.float32)
+        radiance = np.repeat(alpha[..., None], 3, axis=2)
+        return Rendered(radiance, alpha, mask, 20 * alpha, np.ones(len(POINTS), dtype=bool))
+
+
+def black(shot: Shot, window: Crop) -> np.ndarray:
+    return np.zeros((window.size, window.size, 3), dtype=np.float32)
+
+
+def clip(radiance: np.ndarray, sensor: Sensor, scale: float, seed: int) -> np.ndarray:
+    return np.uint8(255 * np.clip(radiance, 0, 1))
+
+
+def built(name: str, folder: Path) -> Spacecraft:
+    (folder / f"{name}.glb").touch()
+    craft = Spacecraft(name, tuple("abcde"), POINTS, ((0, 1), (2, 3)), 2.5, mesh_path=folder / f"{name}.glb")
+    save_spacecraft(craft, folder / f"{name}.toml")
+    return craft
+
+
+@pytest.fixture(autouse=True)
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "Renderer", PaintedRenderer)
+    monkeypatch.setattr(worker, "shoot", shot_of)
+    monkeypatch.setattr(stage, "shoot", shot_of)
+    monkeypatch.setattr(worker, "background", black)
+    monkeypatch.setattr(worker, "expose", clip)
+    monkeypatch.setattr(fleet, "build", built)
+
+
+def run(out: Path, **options: object) -> stage.Generated:
+    chosen = {"recipe": recipe(), "seed": 5, "size": 64, "workers": 1, "variant": "scalar_rgb"} | options
+    return stage.generate(out=out, **chosen)  # type: ignore[arg-type]
+
+
+def everything(root: Path) -> dict[str, bytes]:
+    paths = [p for p in root.rglob("*") if p.is_file() and p.name != "contact_sheet.jpg" and p.suffix != ".pth"]
+    return {str(p.relative_to(root)): p.read_bytes() for p in paths}
+
+
+def test_keypoints_fall_on_their_discs(tmp_path: Path) -> None:
+    """Pose, camera and picture agree, for the whole sensor and for windows that leave it."""
+    for window in ("frame", "target"):
+        root = tmp_path / window
+        run(root, window=window, size=128, mask=True, frames=6, sequences=1)
+        dataset = SkdDataset(root, spacecraft="satellite_02")
+        for frame in dataset:
+            pixels = frame.keypoints_px(dataset.spacecraft.points_m)
+            for (x, y), seen in zip(pixels, frame.visible, strict=True):
+                inside = 0 <= x < frame.camera.width and 0 <= y < frame.camera.height
+                assert not (seen and not inside)
+                if seen:
+                    assert frame.image[int(y), int(x)].min() > 200
+        masks = [read_mask(dataset.extras(i).mask_path) for i in range(len(dataset))]
+        assert all(mask.shape == frame.image.shape[:2] for mask, frame in zip(masks, dataset, strict=True))
+        assert (root / "contact_sheet.jpg").exists()
+
+
+def test_windows_are_black_beyond_the_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "background", lambda shot, window: black(shot, window) + 0.5)
+    run(tmp_path, window="target", size=96, mask=True, sequences=1, frames=1, spacecraft="satellite_01")
+    frame = SkdDataset(tmp_path).frame(0)
+    full_from_window = CAMERA.matrix @ np.linalg.inv(frame.camera.matrix)
+    y, x = np.mgrid[:96, :96] + 0.5
+    full_x = full_from_window[0, 0] * x + full_from_window[0, 2]
+    full_y = full_from_window[1, 1] * y + full_from_window[1, 2]
+    outside = np.hypot(np.maximum(0, 8 - full_x), np.maximum(0, 8 - full_y)) > 24
+    inside = (full_x > 16) & (full_y > 16)
+    if outside.any():
+        assert frame.image[outside].max() < 40
+    assert frame.image[inside].min() > 90
+
+
+def test_same_seed_same_bytes_whatever_the_order(tmp_path: Path) -> None:
+    run(tmp_path / "a")
+    for i in (1, 0):
+        run(tmp_path / "b", shard=(i, 2), every=2)
+        run(tmp_path / "b", shard=(i, 2))
+    assert everything(tmp_path / "a") == everything(tmp_path / "b")
+    assert len(SkdDataset(tmp_path / "a")) == 15 * 6
+    assert Counter(path.stem for path in tmp_path.glob("a/*.json")) == Counter(["train", "val", "test", "recipe"])
+
+
+def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(tmp_path / "whole", sequences=1)
+    drawn = []
+    paint = worker.render_frame
+
+    def killed(studio: worker.Studio, name: str, sequence: int, index: int) -> dict[str, str]:
+        if len(drawn) == 9:
+            raise KeyboardInterrupt
+        drawn.append((sequence, index))
+        return paint(studio, name, sequence, index)
+
+    monkeypatch.setattr(worker, "render_frame", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", sequences=1)
+    assert not list(tmp_path.rglob("*.tmp"))
+    journal = tmp_path / "cut/data/000002" / worker.JOURNAL
+    journal.write_text(journal.read_text()[:-30])  # the last line was cut as well
+    (tmp_path / "cut/data/000001/image/000002.jpg").write_bytes(b"\xff\xd8 cut")
+    monkeypatch.setattr(worker, "render_frame", paint)
+    result = run(tmp_path / "cut", sequences=1)
+    assert (result.kept, result.rendered) == (7, 11)
+    assert everything(tmp_path / "cut") == everything(tmp_path / "whole")
+    assert run(tmp_path / "cut", sequences=1).rendered == 0
+
+
+def test_a_bad_frame_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paint = worker.render_frame
+
+    def clumsy(studio: worker.Studio, name: str, sequence: int, index: int) -> dict[str, str]:
+        if index == 3:
+            raise GknetError("no light")
+        return paint(studio, name, sequence, index)
+
+    monkeypatch.setattr(worker, "render_frame", clumsy)
+    result = run(tmp_path, sequences=1, spacecraft="satellite_03")
+    assert result.rendered == 5
+    assert result.failures == ("data/000003 frame 3: GknetError: no light",)
+    dataset = SkdDataset(tmp_path)
+    assert [dataset.extras(i).index for i in range(len(dataset))] == [0, 1, 2, 4, 5]
+    monkeypatch.setattr(worker, "render_frame", paint)
+    assert run(tmp_path, sequences=1, spacecraft="satellite_03").rendered == 1
+
+
+def test_a_full_disk_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> dict[str, str]:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(worker, "render_frame", full)
+    with pytest.raises(OSError, match="No space"):
+        run(tmp_path)
+
+
+def test_other_options_are_refused(tmp_path: Path) -> None:
+    run(tmp_path, sequences=1, frames=1)
+    other = recipe().model_copy(update={"frames": 7})
+    for changed in ({"seed": 6}, {"size": 96}, {"window": "target"}, {"spp": 16}, {"depth": True}, {"recipe": other}):
+        with pytest.raises(GknetError, match=next(iter(changed))):
+            run(tmp_path, sequences=1, frames=1, **changed)
+    (tmp_path / "recipe.json").write_text("{")
+    with pytest.raises(GknetError, match=r"recipe.json"):
+        run(tmp_path)
+    (tmp_path / "recipe.json").unlink()
+    with pytest.raises(GknetError, match="another folder"):
+        run(tmp_path)
+
+
+def test_depth_is_written_on_demand(tmp_path: Path) -> None:
+    run(tmp_path, sequences=1, frames=1, depth=True)
+    extras = SkdDataset(tmp_path).extras(0)
+    depth = np.load(extras.depth_path)["depth_m"]
+    assert depth.dtype == np.float32
+    np.testing.assert_array_equal(depth > 0, read_mask(extras.mask_path))
+
+
+def test_plans_follow_the_selection() -> None:
+    plans = plan_sequences(recipe(30, 10), Selection(("satellite_02",), "train", every=3, first=1, frames=2))
+    assert {plan.spacecraft for plan in plans} == {"satellite_02"}
+    assert {recipe(30).split_of(plan.sequence) for plan in plans} == {"train"}
+    assert {plan.indices for plan in plans} == {(1, 4)}
+    shards = [plan_sequences(recipe(30), Selection(shard=(i, 4))) for i in range(4)]
+    assert sorted(plan.sequence for shard in shards for plan in shard) == list(range(30))
+    limited = plan_sequences(recipe(30), Selection(sequences=2))
+    assert Counter(plan.spacecraft for plan in limited) == {name: 2 for name in fleet.NAMES}
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [
+        {"spacecraft": ("satellite_9",)},
+        {"split": "dev"},
+        {"every": 0},
+        {"frames": 0},
+        {"first": -1},
+        {"first": 6},
+        {"shard": (2, 2)},
+        {"sequences": 0},
+    ],
+)
+def test_bad_selections_are_named(selection: dict) -> None:
+    with pytest.raises(GknetError):
+        plan_sequences(recipe(), Selection(**selection))
+
+
+@pytest.mark.parametrize("option", [{"window": "crop"}, {"size": 4}, {"spp": 0}, {"seed": -1}])
+def test_bad_options_are_named(option: dict) -> None:
+    good = Options(recipe(), seed=0, window="frame", size=64, spp=4, mask=True, depth=False)
+    with pytest.raises(GknetError, match=next(iter(option))):
+        replace(good, **option)
+
+
+def test_target_windows_hold_the_box_at_native_resolution() -> None:
+    random = np.random.default_rng(0)
+    for seed in range(300):
+        side = random.uniform(20, 900)
+        x, y = random.uniform(0, 1024 - side, 2)
+        box = Box(x, y, x + side, y + random.uniform(0.3, 1) * side)
+        window = target_window(box, 320, seed)
+        assert window == target_window(box, 320, seed)
+        assert window.x0 <= box.x0
+        assert window.y0 <= box.y0
+        assert window.x0 + window.side >= box.x1
+        assert window.y0 + window.side >= box.y1
+        assert 1.3 < window.side / box.side < 1.8
+        assert window.size in FILM_SIZES
+        assert window.size >= min(window.side, 320)
+        smaller = [size for size in FILM_SIZES if size < window.size]
+        assert not smaller or smaller[-1] < window.side
+    assert len({target_window(Box(100, 100, 300, 300), 320, seed) for seed in range(20)}) == 20
+
+
+def test_shards_are_parsed() -> None:
+    assert parse_shard("3/8") == (3, 8)
+    for text in ("3", "a/b", "1/2/3", "-1/2"):
+        with pytest.raises(GknetError, match="shard"):
+            parse_shard(text)
+
+
+def test_recipe_json_tells_what_the_folder_is(tmp_path: Path) -> None:
+    run(tmp_path, sequences=1, frames=1)
+    told = json.loads((tmp_path / "recipe.json").read_text())
+    assert (told["seed"], told["window"], told["recipe"]["name"]) == (5, "frame", "skd")
+    assert read_image(tmp_path / "contact_sheet.jpg").shape[1] == 3 * 256
