@@ -7,6 +7,7 @@ mean states how many frames it is over, and failures count (E_t = 1, E_q = pi, A
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
@@ -236,7 +237,11 @@ class Bin:
 
 @dataclass(frozen=True)
 class Summary:
-    """Of many frames. `failures` counts each reason; the coverages are of the poses' 6x6 covariances."""
+    """Of many frames. The coverages are of the poses' 6x6 covariances, over the frames that have a pose.
+
+    failures     frames per reason, its numbers written as #
+    located_07   part of the frames whose box overlaps the true one by an IoU of 0.7 or more
+    """
 
     frames: int
     sequences: int
@@ -279,7 +284,8 @@ def _reasons(frame_errors: Sequence[FrameErrors]) -> dict[str, int]:
     reasons: dict[str, int] = {}
     for error in frame_errors:
         if error.failure is not None:
-            reasons[error.failure] = reasons.get(error.failure, 0) + 1
+            reason = re.sub(r"\d+(\.\d+)?", "#", error.failure)
+            reasons[reason] = reasons.get(reason, 0) + 1
     return reasons
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
 from gknet.errors import GknetError
 from gknet.frame import Keypoints
@@ -145,11 +144,7 @@ def _consensus(problem: _Problem, score: Float[ndarray, "k"], threshold_px: floa
     )
     if report["num_inliers"] < 4 or not np.isfinite(found.t).all() or not np.isfinite(found.R).all():
         return None
-    return Pose(_orthonormal(found.R), found.t)
-
-
-def _orthonormal(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
-    return Rotation.from_matrix(rotation).as_matrix()
+    return Pose(found.R, found.t)
 
 
 def _residuals_px(problem: _Problem, pose: Pose) -> Float[ndarray, "k"]:
@@ -165,13 +160,15 @@ def _linearise(problem: _Problem, pose: Pose) -> tuple[Float[ndarray, "k 2"], Fl
         turned + pose.translation_m, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
     )
     by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
-    by_turn = np.cross(turned[:, None], by_point)  # a . (dw x p) = dw . (p x a)
+    x, y, z = turned.T[:, :, None]
+    a, b, c = by_point.transpose(2, 0, 1)
+    by_turn = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=2)  # a . (dw x p) = dw . (p x a)
     return problem.pixels - projected[:, 0], np.concatenate([by_turn, by_point], axis=2)
 
 
 def _moved(pose: Pose, step: Float[ndarray, "6"]) -> Pose:
-    rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation
-    return Pose(_orthonormal(rotation), pose.translation_m + step[3:])
+    turn, _ = cv2.Rodrigues(step[:3])
+    return Pose(turn @ pose.rotation, pose.translation_m + step[3:])
 
 
 def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
@@ -195,7 +192,7 @@ def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
         if trial_cost > cost:
             damping *= 10
             continue
-        settled = cost - trial_cost < 1e-9 * max(cost, 1e-12)
+        settled = cost - trial_cost < 1e-7 * max(cost, 1e-12)
         pose, residual, jacobian, cost, weight = trial, trial_residual, trial_jacobian, trial_cost, trial_weight
         damping *= 0.1
         if settled:

@@ -1,4 +1,4 @@
-"""What `gknet predict` may be given: an image, a folder of images, a video or an SKD dataset, all as Frames in order."""
+"""What `gknet predict` may be given, all as Frames in order: an image, a folder of them, a video, an SKD dataset."""
 
 from __future__ import annotations
 

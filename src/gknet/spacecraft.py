@@ -127,16 +127,19 @@ def spacecraft_from_toml(text: str, source: str, folder: Path | None = None) -> 
         for end in edge:
             if end not in index:
                 raise GknetError(f"{source}: edges: '{end}' is no keypoint; expected one of {', '.join(index)}")
-    return Spacecraft(
-        name=file.name,
-        keypoint_names=tuple(keypoint.name for keypoint in file.keypoint),
-        points_m=np.array([keypoint.point_m for keypoint in file.keypoint]),
-        edges=tuple((index[a], index[b]) for a, b in file.edges),
-        diameter_m=file.diameter_m,
-        symmetries=tuple(file.symmetry),
-        mesh_path=folder / file.mesh if folder is not None and file.mesh else None,
-        description=file.description,
-    )
+    try:
+        return Spacecraft(
+            name=file.name,
+            keypoint_names=tuple(keypoint.name for keypoint in file.keypoint),
+            points_m=np.array([keypoint.point_m for keypoint in file.keypoint]),
+            edges=tuple((index[a], index[b]) for a, b in file.edges),
+            diameter_m=file.diameter_m,
+            symmetries=tuple(file.symmetry),
+            mesh_path=folder / file.mesh if folder is not None and file.mesh else None,
+            description=file.description,
+        )
+    except GknetError as error:
+        raise GknetError(f"{source}: {error}") from error
 
 
 def _parse(text: str, source: str) -> _File:

@@ -15,6 +15,9 @@ from numpy import ndarray
 
 from gknet.errors import GknetError
 
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+"""FFmpeg's own words on standard error are for its developers; what is wrong is said by a GknetError."""
+
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
 
 

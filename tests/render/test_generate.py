@@ -1,4 +1,4 @@
-"""The rendering stage: what is planned, what is written, what a resumed job does. The pictures are made by stand-ins."""
+"""The rendering stage: what is planned and written, what a resumed job does. Stand-ins make the pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gknet.render import worker
 from gknet.render.plan import FILM_SIZES, Options, Selection, parse_shard, plan_sequences, target_window
 from gknet.render.recipe import Recipe, load_recipe
 from gknet.render.scenario import CAMERA, Sensor, Shot
-from gknet.render.scene import Rendered
+from gknet.render.scene import Rendered, Renderer
 from gknet.spacecraft import Spacecraft, save_spacecraft
 
 POINTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.5], [0, 0, 1]])
@@ -56,7 +56,6 @@ def shot_of(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, in
         camera=CAMERA,
         cam_from_body=Pose(np.eye(3), np.array([2.0 * index - 4, 0.5 * sequence - 2, 20.0])),
         sun_direction=np.array([0.0, 0.0, -1.0]),
-        earth_direction=np.array([0.0, 1.0, 0.0]),
         earth=None,
         cam_from_inertial=np.eye(3),
         sensor=SENSOR,
@@ -64,7 +63,7 @@ def shot_of(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, in
     )
 
 
-class PaintedRenderer:
+class PaintedRenderer(Renderer):
     """Stands in for Mitsuba: a white disc of 0.3 m at each keypoint, on a craft of which all is visible."""
 
     def __init__(self, spacecraft: Spacecraft, variant: str, spp: int, threads: int | None) -> None:
@@ -100,7 +99,6 @@ def built(name: str, folder: Path) -> Spacecraft:
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "Renderer", PaintedRenderer)
     monkeypatch.setattr(worker, "shoot", shot_of)
-    monkeypatch.setattr(stage, "shoot", shot_of)
     monkeypatch.setattr(worker, "background", black)
     monkeypatch.setattr(worker, "expose", clip)
     monkeypatch.setattr(fleet, "build", built)
@@ -241,7 +239,7 @@ def test_plans_follow_the_selection() -> None:
     shards = [plan_sequences(recipe(30), Selection(shard=(i, 4))) for i in range(4)]
     assert sorted(plan.sequence for shard in shards for plan in shard) == list(range(30))
     limited = plan_sequences(recipe(30), Selection(sequences=2))
-    assert Counter(plan.spacecraft for plan in limited) == {name: 2 for name in fleet.NAMES}
+    assert Counter(plan.spacecraft for plan in limited) == dict.fromkeys(fleet.NAMES, 2)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,9 @@ from gknet.cli.render import render
 from gknet.cli.train import export, train
 from gknet.errors import GknetError, MissingExtraError
 
+_USAGE_ERROR = typer.BadParameter.__mro__[1]
+"""What typer raises for a wrong command line: the parent of its BadParameter."""
+
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
 
 _EXTRA_OF_MODULE = {
@@ -31,7 +34,6 @@ _EXTRA_OF_MODULE = {
 app = typer.Typer(
     name="gknet",
     help="Pose of known spacecraft from a picture: render, train, export, predict, evaluate.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -66,20 +68,18 @@ def run(arguments: Sequence[str]) -> int:
 
     With GKNET_DEBUG=1 errors keep their tracebacks.
     """
-    from click.exceptions import Abort, ClickException
-
     debug = os.environ.get("GKNET_DEBUG", "") not in ("", "0")
     try:
-        code = app(list(arguments), prog_name="gknet", standalone_mode=False)
-        return code if isinstance(code, int) else 0
-    except (KeyboardInterrupt, Abort):
-        return _end("interrupted", INTERRUPTED)
-    except ClickException as error:
+        code = app(list(arguments) or ["--help"], prog_name="gknet", standalone_mode=False)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except _USAGE_ERROR as error:
         return _end(error.format_message(), BAD_INPUT)
     except Exception as error:
         if debug:
             raise
         return _end_badly(error)
+    return _end("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
 
 
 def _end_badly(error: Exception) -> int:
@@ -90,7 +90,7 @@ def _end_badly(error: Exception) -> int:
         if module in _EXTRA_OF_MODULE:
             return _end(str(MissingExtraError(_EXTRA_OF_MODULE[module], module)), BAD_INPUT)
     if isinstance(error, BrokenPipeError):
-        sys.stdout = open(os.devnull, "w")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_INPUT
     if isinstance(error, OSError):
         return _end(_os_message(error), BAD_INPUT)

@@ -93,7 +93,7 @@ def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | 
         raise GknetError("give either --spacecraft NAME (a shipped model) or --model FOLDER")
     if threads is not None and threads < 1:
         raise GknetError(f"--threads: expected 1 or more, got {threads}")
-    return load_estimator(spacecraft if model is None else model, threads=threads)
+    return load_estimator(model or spacecraft or "", threads=threads)
 
 
 def predict_all(

@@ -11,11 +11,24 @@ from gknet.fleet import materials as m
 from gknet.fleet import shapes as s
 from gknet.fleet.materials import CELL_M, Material
 from gknet.fleet.model import Model
-from gknet.fleet.shapes import frame, point_of
+from gknet.fleet.shapes import Point, frame, point_of
 
 RIM_M = 0.02
 """Bare border of a solar panel, and the gap between its two sheets of cells."""
 THICKNESS_M = 0.026
+
+
+def bus_frame(model: Model, half: Point, height: float = 0.0) -> None:
+    """A bus at `height` on the z axis: corner posts that reach `half` on each side, beams, black foil behind them."""
+    outside = np.asarray(half, dtype=float)
+    at = frame((0, 0, height))
+    model.add("bus", m.black_foil(), s.box(2 * (outside - 0.03), radius=0.01), at=at)
+    x, y, z = outside - 0.025
+    signs = [(a, b) for a in (-1, 1) for b in (-1, 1)]
+    posts = [s.box((0.05, 0.05, 2 * outside[2]), (a * x, b * y, 0), 0.006) for a, b in signs]
+    beams = [s.box((2 * x, 0.044, 0.044), (0, a * y, b * z), 0.006) for a, b in signs]
+    beams += [s.box((0.044, 2 * y, 0.044), (a * x, 0, b * z), 0.006) for a, b in signs]
+    model.add("bus", m.aluminium(), *posts, *beams, at=at)
 
 
 def panel_size(columns: int, rows: int) -> tuple[float, float]:
@@ -54,7 +67,7 @@ def _ribs(width: float, length: float) -> list[trimesh.Trimesh]:
     z = -THICKNESS_M / 2
     ribs = [s.box((0.025, length - 0.06, 0.02), (x, 0, z - 0.008), 0.003, 2) for x in _ends(0.3 * width)]
     ribs += [s.box((width - 0.06, 0.02, 0.014), (0, y, z - 0.005), 0.003, 2) for y in _ends(0.36 * length)]
-    cup = s.turned([(0, z + 0.004), (0.035, z + 0.004), (0.035, z - 0.01), (0.02, z - 0.028), (0, z - 0.028)], 24)
+    cup = s.turned([(0, z + 0.004), (0.035, z + 0.004), (0.035, z - 0.01), (0.02, z - 0.028), (0, z - 0.028)], 16)
     places = [(x, y) for x in _ends(0.15 * width) for y in _ends(0.2 * length)]
     return ribs + [cup.copy().apply_translation((x, y, 0)) for x, y in places]
 
@@ -64,13 +77,13 @@ def _harness(width: float, length: float) -> list[trimesh.Trimesh]:
     y = np.linspace(-length / 2 + 0.04, length / 2 - 0.04, 7)
     wave = 0.008 * np.cos(np.pi * np.arange(7))
     z = np.full(7, -THICKNESS_M / 2 - 0.004)
-    return [s.cable(np.column_stack([x + wave, y, z]), 0.005, 6, 5) for x in (-0.05 * width, 0.03 * width)]
+    return [s.cable(np.column_stack([x + wave, y, z]), 0.005, 6, 4) for x in (-0.05 * width, 0.03 * width)]
 
 
 def hinges(model: Model, part: str, at: Float[ndarray, "4 4"], width: float, gap: float) -> None:
     """Two spring hinges across a gap along y, at the frame's origin, `width` apart along x."""
     for x in _ends(width / 2):
-        knuckle = s.rod((x - 0.035, 0, 0.002), (x + 0.035, 0, 0.002), 0.012, 16)
+        knuckle = s.rod((x - 0.035, 0, 0.002), (x + 0.035, 0, 0.002), 0.012, 12)
         leaves = [s.box((0.05, 0.05, 0.008), (x, y, 0.014), 0.002, 2) for y in _ends(gap / 2 + 0.02)]
         model.add(part, m.aluminium(), knuckle, *leaves, at=at)
 
@@ -90,25 +103,35 @@ def yoke(model: Model, part: str, at: Float[ndarray, "4 4"], reach: float, width
 def thruster(model: Model, part: str, at: Float[ndarray, "4 4"], exit_radius: float = 0.045) -> None:
     """A small thruster that fires along +z; the middle of its mouth is at (0, 0, 0.13)."""
     length = 2 * exit_radius
-    bell = s.nozzle(0.4 * exit_radius, exit_radius, length, length - 0.012, 32).apply_translation((0, 0, 0.142 - length))
-    body = s.cylinder(0.4 * exit_radius, 0.0, 0.145 - length, 24)
-    flange = s.cylinder(0.75 * exit_radius, -0.01, 0.012, 32)
+    bell = s.nozzle(0.4 * exit_radius, exit_radius, length, length - 0.008, 20, 5).apply_translation(
+        (0, 0, 0.138 - length)
+    )
+    body = s.cylinder(0.4 * exit_radius, 0.0, 0.141 - length, 12)
+    flange = s.cylinder(0.75 * exit_radius, -0.01, 0.012, 16)
     model.add(part, m.nozzle_metal(), bell, body, at=at)
     model.add(part, m.aluminium(), flange, at=at)
 
 
 def engine(model: Model, part: str, at: Float[ndarray, "4 4"], exit_radius: float, length: float) -> None:
     """A large engine along +z, hollow to its throat."""
-    bell = s.nozzle(0.22 * exit_radius, exit_radius, length, 0.06 * length, 64)
+    sections = 64 if exit_radius > 0.15 else 32
+    bell = s.nozzle(0.22 * exit_radius, exit_radius, length, 0.06 * length, sections, 7)
     bands = [
-        s.tube(radius + 0.006, radius - 0.01, z - 0.006, z + 0.006, 64)
+        s.tube(radius + 0.006, radius - 0.01, z - 0.006, z + 0.006, sections)
         for z, radius in ((t * length, exit_radius * (0.22 + 0.78 * t**0.6)) for t in (0.35, 0.7))
     ]
     model.add(part, m.nozzle_metal(), bell, *bands, at=at)
-    head = s.cylinder(0.42 * exit_radius, -0.35 * length, 0.04 * length, 40)
+    head = s.cylinder(0.42 * exit_radius, -0.35 * length, 0.04 * length, sections // 2)
     feeds = [
-        s.cable([(a * 0.6 * exit_radius, b * 0.6 * exit_radius, -0.5 * length), (a * 0.7 * exit_radius, 0, -0.2 * length),
-                 (0.2 * a * exit_radius, 0, 0.02 * length)], 0.012)
+        s.cable(
+            [
+                (a * 0.6 * exit_radius, b * 0.6 * exit_radius, -0.5 * length),
+                (a * 0.7 * exit_radius, 0, -0.2 * length),
+                (0.2 * a * exit_radius, 0, 0.02 * length),
+            ],
+            0.012,
+            steps=5,
+        )
         for a, b in ((-1, 1), (1, -1))
     ]
     model.add(part, m.steel(), head, *feeds, at=at)
@@ -117,9 +140,21 @@ def engine(model: Model, part: str, at: Float[ndarray, "4 4"], exit_radius: floa
 def star_tracker(model: Model, part: str, at: Float[ndarray, "4 4"], length: float = 0.3) -> None:
     """A camera with a stepped baffle along +z; the middle of its lens cap is at (0, 0, length)."""
     baffle = s.turned(
-        [(0, 0.02), (0.045, 0.02), (0.045, 0.4 * length), (0.085, length), (0.078, length), (0.06, length - 0.006), (0, length - 0.006)], 40
+        [
+            (0, 0.02),
+            (0.045, 0.02),
+            (0.045, 0.4 * length),
+            (0.085, length),
+            (0.078, length),
+            (0.06, length - 0.006),
+            (0, length - 0.006),
+        ],
+        40,
     )
-    vanes = [s.tube(0.05 + 0.04 * t, 0.03 + 0.04 * t, length * (0.4 + 0.6 * t) - 0.006, length * (0.4 + 0.6 * t), 40) for t in (0.1, 0.5)]
+    vanes = [
+        s.tube(0.05 + 0.04 * t, 0.03 + 0.04 * t, length * (0.4 + 0.6 * t) - 0.006, length * (0.4 + 0.6 * t), 40)
+        for t in (0.1, 0.5)
+    ]
     model.add(part, m.black_paint(), baffle, *vanes, at=at)
     model.add(part, m.glass(), s.cylinder(0.055, length - 0.012, length, 32), at=at)
     fins = [s.box((0.15, 0.15, 0.008), (0, 0, z), 0.002, 2) for z in (-0.02, 0.0, 0.02)]
@@ -130,10 +165,11 @@ def helix_antenna(model: Model, part: str, at: Float[ndarray, "4 4"], height: fl
     """A helix over a ground plate along +z; its tip is at (0, 0, height)."""
     t = np.linspace(0, 1, 60)
     shrink = radius * (1 - 0.45 * t)
-    coil = np.column_stack([shrink * np.cos(14 * np.pi * t), shrink * np.sin(14 * np.pi * t), 0.02 + t * (height - 0.05)])
+    coil = np.column_stack(
+        [shrink * np.cos(14 * np.pi * t), shrink * np.sin(14 * np.pi * t), 0.02 + t * (height - 0.12)]
+    )
     model.add(part, m.copper(), s.cable(coil, 0.005, 6, 3), at=at)
-    mast = s.cylinder(0.012, 0.0, height - 0.015, 16)
-    model.add(part, m.white_paint(), mast, s.ball(0.025, (0, 0, height - 0.025)), at=at)
+    model.add(part, m.white_paint(), s.spike(0.013, 0.0, height), at=at)
     model.add(part, m.aluminium(), s.cylinder(1.9 * radius, -0.015, 0.012, 40), at=at)
 
 
@@ -143,7 +179,11 @@ def dish_antenna(
     """A white dish that looks along +z from the origin, with feed and struts. Returns the feed's outer tip."""
     model.add(part, m.white_paint(), s.dish(radius, depth), at=at)
     spokes = [
-        s.rod((0.12 * radius * c, 0.12 * radius * d, -0.05), (0.85 * radius * c, 0.85 * radius * d, 0.70 * depth - 0.01), 0.014)
+        s.rod(
+            (0.12 * radius * c, 0.12 * radius * d, -0.05),
+            (0.85 * radius * c, 0.85 * radius * d, 0.70 * depth - 0.01),
+            0.014,
+        )
         for c, d in s.regular(6, 1.0)
     ]
     hub = s.cylinder(0.22 * radius, -0.12, -0.008, 40)
@@ -153,23 +193,36 @@ def dish_antenna(
         for c, d in s.regular(3, 1.0, np.pi / 2)
     ]
     model.add(part, m.aluminium(), hub, ring, *spokes, *struts, at=at)
-    cone = s.turned([(0, focus - 0.09), (0.03, focus - 0.09), (0.085, focus), (0.085, focus + 0.03), (0.05, focus + 0.05), (0, focus + 0.05)], 40)
+    cone = s.turned(
+        [
+            (0, focus - 0.09),
+            (0.03, focus - 0.09),
+            (0.085, focus),
+            (0.085, focus + 0.03),
+            (0.05, focus + 0.05),
+            (0, focus + 0.05),
+        ],
+        40,
+    )
     horn = s.turned([(0, 0), (0.07, 0), (0.045, 0.06), (0.06, 0.16), (0.05, 0.16), (0.03, 0.08), (0, 0.08)], 40)
     model.add(part, m.white_paint(), cone, at=at)
     model.add(part, m.black_paint(), horn, at=at)
     return point_of(at, (0, 0, focus + 0.05))
 
 
-def blanket(
-    model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[float, float], material: Material
-) -> None:
+def blanket(model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[float, float], material: Material) -> None:
     """A padded foil blanket on a wall that looks to +z, held by buttons."""
     width, height = size
     model.add(part, material, s.box((width, height, 0.05), (0, 0, 0.0), 0.022, 4), at=at)
     columns, rows = max(2, round(width / 0.3)), max(2, round(height / 0.3))
     x, y = np.meshgrid(np.linspace(-0.44, 0.44, columns) * width, np.linspace(-0.44, 0.44, rows) * height)
     button = s.turned([(0, 0.02), (0.014, 0.02), (0.014, 0.027), (0.008, 0.030), (0, 0.030)], 12)
-    model.add(part, m.aluminium(), *[button.copy().apply_translation((a, b, 0)) for a, b in zip(x.flat, y.flat, strict=True)], at=at)
+    model.add(
+        part,
+        m.aluminium(),
+        *[button.copy().apply_translation((a, b, 0)) for a, b in zip(x.flat, y.flat, strict=True)],
+        at=at,
+    )
 
 
 def radiator(model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[float, float]) -> None:

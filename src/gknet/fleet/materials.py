@@ -99,12 +99,12 @@ def _foil(name: str, colour: Colour, metallic: float, roughness: float, slope: f
 
 @cache
 def gold_foil() -> Material:
-    return _foil("gold_foil", (0.93, 0.70, 0.33), 0.9, 0.35, 0.55, seed=1)
+    return _foil("gold_foil", (0.93, 0.70, 0.33), 0.88, 0.38, 0.55, seed=1)
 
 
 @cache
 def silver_foil() -> Material:
-    return _foil("silver_foil", (0.84, 0.85, 0.87), 0.9, 0.3, 0.4, seed=2)
+    return _foil("silver_foil", (0.86, 0.87, 0.89), 0.8, 0.4, 0.4, seed=2)
 
 
 @cache
@@ -115,12 +115,12 @@ def black_foil() -> Material:
 @cache
 def purple_foil() -> Material:
     """The doped-silicon side of a sunshield."""
-    return _foil("purple_foil", (0.72, 0.56, 0.66), 0.85, 0.35, 0.3, seed=4)
+    return _foil("purple_foil", (0.72, 0.56, 0.66), 0.75, 0.42, 0.3, seed=4)
 
 
 @cache
 def solar_cells() -> Material:
-    return _cells("solar_cells", (0.11, 0.15, 0.36), seed=5)
+    return _cells("solar_cells", (0.13, 0.18, 0.43), seed=5)
 
 
 @cache
@@ -193,7 +193,7 @@ def aluminium() -> Material:
     rng = np.random.default_rng(9)
     streaks = gaussian_filter(rng.normal(size=(256, 256)), (0.6, 18), mode="wrap")
     shade = 0.80 + 0.035 * streaks / streaks.std()
-    return _textured("aluminium", shade[..., None] * np.array([1.0, 1.0, 1.01]), 0.9, 0.38, (0.3, 0.3))
+    return _textured("aluminium", shade[..., None] * np.array([1.0, 1.0, 1.01]), 0.7, 0.45, (0.3, 0.3))
 
 
 @cache

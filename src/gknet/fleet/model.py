@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -57,7 +59,7 @@ class Model:
 
     def link(self, *chain: str) -> None:
         """Edges of the skeleton along a chain of keypoints."""
-        self.edges += list(zip(chain[:-1], chain[1:], strict=True))
+        self.edges += list(pairwise(chain))
 
     def scene(self) -> trimesh.Scene:
         """One node a part and material, in the order of building."""
@@ -111,23 +113,27 @@ def _finished(mesh: trimesh.Trimesh, material: Material, around: bool) -> trimes
 
 def _merged(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Meshes of one material as one, every vertex with its own normal and texture coordinate."""
+    visuals = [cast(TextureVisuals, mesh.visual) for mesh in meshes]
     starts = np.cumsum([0, *[len(mesh.vertices) for mesh in meshes[:-1]]])
     return trimesh.Trimesh(
         vertices=np.vstack([mesh.vertices for mesh in meshes]),
         faces=np.vstack([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
         vertex_normals=np.vstack([mesh.vertex_normals for mesh in meshes]),
-        visual=TextureVisuals(uv=np.vstack([mesh.visual.uv for mesh in meshes]), material=meshes[0].visual.material),
+        visual=TextureVisuals(uv=np.vstack([visual.uv for visual in visuals]), material=visuals[0].material),
         process=False,
     )
 
 
 def _corner_normals(mesh: trimesh.Trimesh) -> Float[ndarray, "c 3"]:
-    """A normal for each corner of each face: the mean over the faces at that vertex within the crease angle."""
+    """A normal for each corner of each face: the mean over the faces at that vertex within the crease angle.
+
+    Faces count by their area, so that a large flat face stays flat and its narrow rounded edge does the bending.
+    """
     vertex = mesh.faces.reshape(-1)
     corner = np.arange(len(vertex))
     at_vertex = csr_matrix((np.ones(len(vertex)), (vertex, corner)))
     pairs = (at_vertex.T @ at_vertex).tocoo()
-    own, weight = mesh.face_normals, mesh.face_angles.reshape(-1)
+    own, weight = mesh.face_normals, np.repeat(mesh.area_faces, 3)
     smooth = np.einsum("ij,ij->i", own[pairs.row // 3], own[pairs.col // 3]) > np.cos(CREASE_RAD)
     row, column = pairs.row[smooth], pairs.col[smooth]
     gather = csr_matrix((weight[column], (row, column)), shape=pairs.shape)

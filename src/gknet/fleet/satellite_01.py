@@ -1,4 +1,4 @@
-"""Satellite_01: a box with two wings, a dish on one side (+x) and a boom on the other; the instruments are on top (+z)."""
+"""Satellite_01: a box with two wings, a dish on +x, a boom on -x, instruments on +z."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ def model() -> Model:
     model = Model(
         "satellite_01",
         "Box bus with two solar wings along y, a dish along +x, a lattice boom along -x, instruments on +z.",
-        (Symmetry(axis=[0, 0, 1], angle_deg=180, broken_by="dish on +x, boom on -x, antenna, bluer outer panel on +y"),),
+        (
+            Symmetry(
+                axis=[0, 0, 1], angle_deg=180, broken_by="dish on +x, boom on -x, antenna, bluer outer panel on +y"
+            ),
+        ),
     )
     _bus(model)
     for side, name in ((1, "plus"), (-1, "minus")):
@@ -35,14 +39,7 @@ def model() -> Model:
 
 
 def _bus(model: Model) -> None:
-    inner = 2 * (HALF - 0.03)
-    model.add("bus", m.black_foil(), s.box(inner, radius=0.01))
-    x, y, z = HALF - 0.025
-    signs = [(a, b) for a in (-1, 1) for b in (-1, 1)]
-    posts = [s.box((0.05, 0.05, 2 * HALF[2]), (a * x, b * y, 0), 0.006) for a, b in signs]
-    beams = [s.box((2 * x, 0.044, 0.044), (0, a * y, b * z), 0.006) for a, b in signs]
-    beams += [s.box((0.044, 2 * y, 0.044), (a * x, 0, b * z), 0.006) for a, b in signs]
-    model.add("bus", m.aluminium(), *posts, *beams)
+    f.bus_frame(model, HALF)
     for side in (-1, 1):
         for part, height, middle in (("upper", 0.66, 0.38), ("lower", 0.74, -0.35)):
             wall = frame((side * (HALF[0] - 0.022), 0, middle), (side, 0, 0), (0, 1, 0))
@@ -50,8 +47,8 @@ def _bus(model: Model) -> None:
         wall = frame((0, side * (HALF[1] - 0.03), 0), (0, side, 0), (1, 0, 0))
         f.blanket(model, "blanket_side", wall @ frame((0, 0, -0.008)), (1.26, 1.46), m.gold_foil())
         for level in (-0.46, 0.46):
-            height = frame((0, side * (HALF[1] - 0.008), level), (0, side, 0), (1, 0, 0))
-            f.radiator(model, "radiator", height, (1.02, 0.46))
+            plate = frame((0, side * (HALF[1] - 0.008), level), (0, side, 0), (1, 0, 0))
+            f.radiator(model, "radiator", plate, (1.02, 0.46))
     for corner, (a, b) in zip(("pp", "pm", "mp", "mm"), ((1, 1), (1, -1), (-1, 1), (-1, -1)), strict=True):
         model.mark(f"bus_top_{corner}", (a * HALF[0], b * HALF[1], HALF[2]))
 
@@ -88,10 +85,22 @@ def _dish(model: Model) -> None:
     at = frame((1.12, 0.0, 0.12), (1, 0, 0.12), (0, 1, 0))
     model.mark("dish_feed", f.dish_antenna(model, "dish", at, radius=0.58, depth=0.17, focus=0.42))
     foot = frame((HALF[0] - 0.01, 0, 0.08), (1, 0, 0), (0, 1, 0))
-    model.add("dish", m.aluminium(), s.cylinder(0.16, 0, 0.06, 40), s.bolts(np.column_stack([s.regular(10, 0.135), np.full(10, 0.06)]), 0.01, 0.01), at=foot)
-    arms = [s.rod((HALF[0], y, z), (1.02, 0.35 * y, 0.11), 0.022, 16) for y, z in ((0.11, 0.0), (-0.11, 0.0), (0, 0.19))]
+    model.add(
+        "dish",
+        m.aluminium(),
+        s.cylinder(0.16, 0, 0.06, 40),
+        s.bolts(np.column_stack([s.regular(10, 0.135), np.full(10, 0.06)]), 0.01, 0.01),
+        at=foot,
+    )
+    arms = [
+        s.rod((HALF[0], y, z), (1.02, 0.35 * y, 0.11), 0.022, 16) for y, z in ((0.11, 0.0), (-0.11, 0.0), (0, 0.19))
+    ]
     model.add("dish", m.black_paint(), *arms, s.ball(0.075, (1.0, 0, 0.105)))
-    model.add("dish", m.copper(), s.cable([(HALF[0], 0.05, -0.05), (0.86, 0.1, -0.02), (0.95, 0.05, 0.05), (1.03, 0.02, 0.1)], 0.012))
+    model.add(
+        "dish",
+        m.copper(),
+        s.cable([(HALF[0], 0.05, -0.05), (0.86, 0.1, -0.02), (0.95, 0.05, 0.05), (1.03, 0.02, 0.1)], 0.012),
+    )
 
 
 def _boom(model: Model) -> None:
@@ -100,8 +109,8 @@ def _boom(model: Model) -> None:
     model.add("boom", m.aluminium(), s.truss(start, end, 0.13, 14, 0.008))
     along = frame(end, end - start, (0, 1, 0))
     model.add("boom", m.black_foil(), s.box((0.17, 0.17, 0.20), (0, 0, 0.08), 0.012, 4), at=along)
-    model.add("boom", m.white_paint(), s.cylinder(0.06, 0.17, 0.24, 32), at=along)
-    model.mark("boom_tip", (0, 0, 0.24), along)
+    model.add("boom", m.white_paint(), s.cylinder(0.06, 0.17, 0.22, 32), s.spike(0.016, 0.2, 0.32), at=along)
+    model.mark("boom_tip", (0, 0, 0.32), along)
     half = frame(start + 0.55 * (end - start), end - start, (0, 1, 0))
     model.add("boom", m.gold_foil(), s.box((0.18, 0.18, 0.10), (0, 0, 0), 0.012, 4), at=half)
     base = frame(start, (-1, 0, 0), (0, 1, 0))
@@ -113,7 +122,13 @@ def _deck(model: Model) -> None:
     top = HALF[2] - 0.005
     f.blanket(model, "deck", frame((0, 0, top - 0.02)), (1.28, 1.08), m.black_foil())
     at = frame((0.30, -0.22, top))
-    model.add("telescope", m.white_paint(), s.turned([(0, 0), (0.20, 0), (0.20, 0.40), (0.17, 0.40), (0.17, 0.12), (0, 0.12)], 64), at=at, around=True)
+    model.add(
+        "telescope",
+        m.white_paint(),
+        s.turned([(0, 0), (0.20, 0), (0.20, 0.40), (0.17, 0.40), (0.17, 0.12), (0, 0.12)], 64),
+        at=at,
+        around=True,
+    )
     model.add("telescope", m.black_paint(), s.tube(0.172, 0.145, 0.02, 0.385, 64), at=at)
     model.add("telescope", m.glass(), s.cylinder(0.15, 0.1, 0.14, 48), at=at)
     rings = [s.tube(0.212, 0.19, z, z + 0.025, 64) for z in (0.05, 0.2, 0.37)]
@@ -129,7 +144,13 @@ def _deck(model: Model) -> None:
     model.add("instruments", m.aluminium(), s.box((0.22, 0.26, 0.12), (-0.12, 0.30, top + 0.05), 0.010))
     model.add("instruments", m.black_paint(), s.tube(0.075, 0.055, 0.15, 0.27, 40), at=frame((0.32, 0.28, top)))
     model.add("instruments", m.white_paint(), s.handle(0.22, 0.06, 0.008), at=frame((-0.12, 0.0, top + 0.015)))
-    model.add("instruments", m.copper(), s.cable([(-0.12, 0.2, top + 0.04), (0.0, 0.05, top + 0.02), (0.1, 0.1, top + 0.02), (0.18, 0.22, top + 0.05)], 0.010))
+    model.add(
+        "instruments",
+        m.copper(),
+        s.cable(
+            [(-0.12, 0.2, top + 0.04), (0.0, 0.05, top + 0.02), (0.1, 0.1, top + 0.02), (0.18, 0.22, top + 0.05)], 0.010
+        ),
+    )
 
 
 def _propulsion(model: Model) -> None:
@@ -137,7 +158,12 @@ def _propulsion(model: Model) -> None:
     down = frame((0, 0, -HALF[2] + 0.02), (0, 0, -1), (1, 0, 0))
     f.blanket(model, "base", down @ frame((0, 0, -0.03)), (1.28, 1.08), m.gold_foil())
     model.add("base", m.aluminium(), s.tube(0.46, 0.43, 0, 0.13, 96), s.tube(0.48, 0.41, 0.11, 0.14, 96), at=down)
-    model.add("base", m.aluminium(), s.bolts(np.column_stack([s.regular(36, 0.445), np.full(36, 0.14)]), 0.009, 0.008), at=down)
+    model.add(
+        "base",
+        m.aluminium(),
+        s.bolts(np.column_stack([s.regular(36, 0.445), np.full(36, 0.14)]), 0.009, 0.008),
+        at=down,
+    )
     f.engine(model, "engine", down @ frame((0, 0, 0.10)), exit_radius=0.19, length=0.34)
     for a in (-1, 1):
         for b in (-1, 1):
@@ -155,7 +181,12 @@ def _skeleton(model: Model) -> None:
         inner, outer = f"wing_{name}_inner", f"wing_{name}_outer"
         model.link(f"{inner}_front", f"{outer}_front", f"{outer}_back", f"{inner}_back", f"{inner}_front")
     model.link("bus_top_pp", "bus_top_pm", "bus_top_mm", "bus_top_mp", "bus_top_pp")
-    for corner, wing in (("pp", "plus_inner_front"), ("mp", "plus_inner_back"), ("pm", "minus_inner_front"), ("mm", "minus_inner_back")):
+    for corner, wing in (
+        ("pp", "plus_inner_front"),
+        ("mp", "plus_inner_back"),
+        ("pm", "minus_inner_front"),
+        ("mm", "minus_inner_back"),
+    ):
         model.link(f"bus_top_{corner}", f"wing_{wing}")
     model.link("bus_top_pp", "dish_feed", "bus_top_pm")
     model.link("bus_top_mp", "antenna_tip")

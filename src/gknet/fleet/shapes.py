@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -13,10 +14,11 @@ from trimesh.creation import extrude_polygon, icosphere, revolve
 from trimesh.util import concatenate
 
 Point = Sequence[float] | Float[ndarray, "3"]
+Points = Sequence[Point] | Float[ndarray, "n 3"]
 
 
 def frame(origin: Point = (0, 0, 0), z: Point = (0, 0, 1), x: Point = (1, 0, 0)) -> Float[ndarray, "4 4"]:
-    """body_from_local of a part that stands at `origin`, its local z along `z`, its local x as near to `x` as can be."""
+    """body_from_local of a part that stands at `origin`, local z along `z`, local x as near to `x` as can be."""
     up = np.asarray(z, dtype=float) / np.linalg.norm(z)
     side = np.asarray(x, dtype=float) - up * (up @ np.asarray(x, dtype=float))
     if np.linalg.norm(side) < 1e-6:
@@ -29,7 +31,9 @@ def frame(origin: Point = (0, 0, 0), z: Point = (0, 0, 1), x: Point = (1, 0, 0))
 
 
 def moved(mesh: trimesh.Trimesh, body_from_local: Float[ndarray, "4 4"]) -> trimesh.Trimesh:
-    return mesh.copy().apply_transform(body_from_local)
+    copy = mesh.copy()
+    copy.apply_transform(body_from_local)
+    return copy
 
 
 def point_of(body_from_local: Float[ndarray, "4 4"], point: Point) -> Float[ndarray, "3"]:
@@ -38,7 +42,7 @@ def point_of(body_from_local: Float[ndarray, "4 4"], point: Point) -> Float[ndar
 
 
 def joined(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
-    return concatenate(list(meshes))
+    return cast(trimesh.Trimesh, concatenate(list(meshes)))
 
 
 def box(size: Point, centre: Point = (0, 0, 0), radius: float = 0.006, steps: int = 3) -> trimesh.Trimesh:
@@ -50,7 +54,8 @@ def box(size: Point, centre: Point = (0, 0, 0), radius: float = 0.006, steps: in
     signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     points = (signs[:, None] * (half - radius + radius * octant)).reshape(-1, 3)
     hull = trimesh.convex.convex_hull(np.unique(np.round(points, 9), axis=0))
-    return hull.apply_translation(centre)
+    hull.apply_translation(centre)
+    return hull
 
 
 def prism(outline: Float[ndarray, "n 2"], z0: float, z1: float, holes: Sequence[ndarray] = ()) -> trimesh.Trimesh:
@@ -85,8 +90,14 @@ def cylinder(radius: float, z0: float, z1: float, sections: int = 32, bevel: flo
     """About z, with bevelled rims."""
     bevel = min(bevel, 0.3 * radius, 0.3 * (z1 - z0))
     return turned(
-        [(0, z0), (radius - bevel, z0), (radius, z0 + bevel), (radius, z1 - bevel), (radius - bevel, z1), (0, z1)], sections
+        [(0, z0), (radius - bevel, z0), (radius, z0 + bevel), (radius, z1 - bevel), (radius - bevel, z1), (0, z1)],
+        sections,
     )
+
+
+def spike(radius: float, z0: float, z1: float, sections: int = 16) -> trimesh.Trimesh:
+    """A rod about z that ends in a slender point at z1, which is seen from nearly everywhere."""
+    return turned([(0, z0), (radius, z0), (radius, z1 - 5 * radius), (0, z1)], sections)
 
 
 def tube(outer: float, inner: float, z0: float, z1: float, sections: int = 48) -> trimesh.Trimesh:
@@ -97,13 +108,13 @@ def ball(radius: float, centre: Point = (0, 0, 0), subdivisions: int = 3) -> tri
     return icosphere(subdivisions=subdivisions, radius=radius).apply_translation(centre)
 
 
-def rod(start: Point, end: Point, radius: float, sections: int = 12) -> trimesh.Trimesh:
+def rod(start: Point, end: Point, radius: float, sections: int = 10) -> trimesh.Trimesh:
     """A round bar between two points."""
     length = float(np.linalg.norm(np.subtract(end, start)))
     return moved(cylinder(radius, 0, length, sections, bevel=0.15 * radius), frame(start, np.subtract(end, start)))
 
 
-def cable(points: Sequence[Point], radius: float, sections: int = 8, steps: int = 8) -> trimesh.Trimesh:
+def cable(points: Points, radius: float, sections: int = 8, steps: int = 8) -> trimesh.Trimesh:
     """A round cable through the points, smooth (Catmull-Rom), with closed ends."""
     path = _smooth(np.asarray(points, dtype=float), steps)
     along = np.gradient(path, axis=0)
@@ -139,12 +150,15 @@ def _skin(rings: Float[ndarray, "n k 3"]) -> trimesh.Trimesh:
     first, last = count * sections, count * sections + 1
     k = np.arange(sections)
     after, end = (k + 1) % sections, (count - 1) * sections
-    caps = [np.stack([np.full(sections, first), after, k], -1), np.stack([np.full(sections, last), end + k, end + after], -1)]
+    caps = [
+        np.stack([np.full(sections, first), after, k], -1),
+        np.stack([np.full(sections, last), end + k, end + after], -1),
+    ]
     vertices = np.vstack([rings.reshape(-1, 3), rings[0].mean(axis=0), rings[-1].mean(axis=0)])
     return oriented(trimesh.Trimesh(vertices, np.concatenate([sides, *caps]), process=False))
 
 
-def dish(radius: float, depth: float, thickness: float = 0.012, sections: int = 72, rings: int = 14) -> trimesh.Trimesh:
+def dish(radius: float, depth: float, thickness: float = 0.012, sections: int = 64, rings: int = 12) -> trimesh.Trimesh:
     """A paraboloid that opens along +z, its vertex at the origin, its rim rolled."""
     r = np.linspace(0, radius, rings)
     front = np.column_stack([r, depth * (r / radius) ** 2])
@@ -153,12 +167,14 @@ def dish(radius: float, depth: float, thickness: float = 0.012, sections: int = 
     return turned([*map(tuple, front), *lip, *map(tuple, back[::-1])], sections)
 
 
-def nozzle(throat: float, exit_radius: float, length: float, floor: float, sections: int = 40) -> trimesh.Trimesh:
+def nozzle(
+    throat: float, exit_radius: float, length: float, floor: float, sections: int = 40, rings: int = 9
+) -> trimesh.Trimesh:
     """A bell from the throat at z = 0 to its open end at z = length; inside it is hollow down to z = floor."""
-    t = np.linspace(0, 1, 9)
+    t = np.linspace(0, 1, rings)
     outer = np.column_stack([throat + (exit_radius - throat) * t**0.6, length * t])
     wall = 0.06 * exit_radius
-    deep = np.linspace(length, floor, 7)
+    deep = np.linspace(length, floor, rings - 2)
     inner = np.column_stack([np.interp(deep, outer[:, 1], outer[:, 0]) - wall, deep])
     return turned([(0, 0), *map(tuple, outer), *map(tuple, inner), (0, floor)], sections)
 

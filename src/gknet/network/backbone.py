@@ -76,7 +76,9 @@ class Encoder(nn.Module):
         inputs = width
         for outputs in self.widths:
             stride = 1 if outputs == width else 2
-            self.stages.append(nn.Sequential(ResidualBlock(inputs, outputs, stride), ResidualBlock(outputs, outputs, 1)))
+            self.stages.append(
+                nn.Sequential(ResidualBlock(inputs, outputs, stride), ResidualBlock(outputs, outputs, 1))
+            )
             inputs = outputs
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Tensor]:

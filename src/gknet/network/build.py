@@ -31,7 +31,7 @@ def configured(config: type[Config], values: Mapping[str, object]) -> Config:
 
 def gknet_s(adjacency: Bool[ndarray, "n n"], graph: str = "skeleton") -> GKNet:
     """The one that ships: 3.5 M parameters, 256 -> 64x64."""
-    config = GKNetConfig(width=32, pyramid_width=64, node_width=128, node_layers=3, heads=4, graph=graph)
+    config = GKNetConfig(width=32, pyramid_width=48, node_width=128, node_layers=3, heads=4, graph=graph)
     return GKNet(config, adjacency)
 
 

@@ -32,7 +32,7 @@ class GKNetConfig:
     """
 
     width: int = 32
-    pyramid_width: int = 64
+    pyramid_width: int = 48
     node_width: int = 128
     node_layers: int = 3
     heads: int = 4
@@ -93,7 +93,7 @@ class GKNet(nn.Module):
         self.pixel_position = nn.Linear(POSITION_WIDTH, config.pyramid_width)
         self.pixel_features = ConvNorm(config.pyramid_width, config.pyramid_width, 1, relu=False)
         self.node_filter = nn.Linear(config.node_width, config.pyramid_width + 1)
-        nn.init.normal_(self.node_filter.weight, std=1e-3)  # the graph's maps start near zero, yet learn at once
+        nn.init.normal_(self.node_filter.weight, std=0.02)  # the graph's maps start near zero, yet learn at once
         nn.init.zeros_(self.node_filter.bias)
         self.fusion = Fusion(len(adjacency))
 
@@ -127,6 +127,7 @@ class GKNet(nn.Module):
         code = position_code(height, width, up).flatten(1).T
         cells = self.pixel_features(up).permute(0, 2, 3, 1).flatten(1, 2)  # (b, hw, p)
         cells = functional.relu(cells + self.pixel_position(code))
-        filters = self.node_filter(nodes)  # (b, n, p + 1), the last one a bias
+        # (b, n, p + 1), the last one a bias; scaled so that one step of Adam moves a map by little
+        filters = self.node_filter(nodes) / self.node_filter.out_features
         maps = cells @ filters[:, :, :-1].transpose(1, 2) + filters[:, None, :, -1]  # (b, hw, n)
         return maps.reshape(batch, height, width, -1).permute(0, 3, 1, 2)

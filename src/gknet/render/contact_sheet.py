@@ -62,8 +62,9 @@ def _tile(frame: Frame, spacecraft: Spacecraft) -> UInt8[ndarray, "t t 3"]:
     pixels = window.to_input(frame.keypoints_px(spacecraft.points_m))
     ends = [_fixed(point) for point in pixels]
     for i, j in spacecraft.edges:
-        if ends[i] and ends[j]:
-            cv2.line(picture, ends[i], ends[j], BONE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+        start, stop = ends[i], ends[j]
+        if start and stop:
+            cv2.line(picture, start, stop, BONE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
     for k, end in enumerate(ends):
         seen = frame.visible is None or frame.visible[k]
         if end:

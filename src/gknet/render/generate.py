@@ -22,6 +22,7 @@ from gknet.dataset.skd_format import frame_stem, sequence_name
 from gknet.dataset.skd_sequence import read_rows
 from gknet.dataset.skd_write import write_annotations, write_camera_matrix, write_sequence_files, write_splits
 from gknet.errors import GknetError, MissingExtraError
+from gknet.geometry import Camera
 from gknet.image import is_whole_jpeg
 from gknet.render.contact_sheet import write_contact_sheet
 from gknet.render.plan import (
@@ -34,7 +35,7 @@ from gknet.render.plan import (
     spacecraft_path,
 )
 from gknet.render.progress import Progress
-from gknet.render.scenario import Recipe, load_recipe, shoot
+from gknet.render.scenario import CAMERA, Recipe, load_recipe
 from gknet.render.scene import choose_variant
 from gknet.render.worker import JOURNAL, Outcome, Studio, read_journal, render_chunk, start_worker, worker_chunk
 from gknet.spacecraft import load_spacecraft
@@ -142,7 +143,9 @@ def _claim(root: Path, options: Options) -> None:
         have = theirs.get(key) if isinstance(theirs, dict) else None
         if have != want:
             names = f"another {key}" if key == "recipe" else f"{key} {have}, not {want}"
-            raise GknetError(f"{root}: it was made with {names} ({path.name}); choose another folder or the same options")
+            raise GknetError(
+                f"{root}: it was made with {names} ({path.name}); choose another folder or the same options"
+            )
 
 
 def _build_spacecraft(root: Path, name: str) -> None:
@@ -163,16 +166,20 @@ def _prepared(root: Path, options: Options, plan: SequencePlan) -> SequencePlan:
     done = _rows(root, options, plan.sequence)
     missing = dataclasses.replace(plan, indices=tuple(i for i in plan.indices if i not in done))
     if missing.indices and not (folder / "camera_matrix.txt").exists():
-        spacecraft = load_spacecraft(spacecraft_path(root, plan.spacecraft))
-        camera = shoot(options.recipe, spacecraft, options.seed, plan.sequence, 0).camera
-        if options.window == "frame":
-            whole = Crop(0, 0, max(camera.width, camera.height), options.size)
-            camera = camera.warped(whole.input_from_image, whole.size, whole.size)
-        write_sequence_files(folder, camera, spacecraft)
+        camera = _whole_camera(options)
+        write_sequence_files(folder, camera, load_spacecraft(spacecraft_path(root, plan.spacecraft)))
         write_camera_matrix(root / "camera_matrix.txt", camera)
     if not missing.indices and (folder / JOURNAL).exists():
         _finish(root, options, plan.sequence)
     return missing
+
+
+def _whole_camera(options: Options) -> Camera:
+    """The whole sensor's camera, at the size of the pictures when they show all of it."""
+    if options.window == "target":
+        return CAMERA
+    whole = Crop(0, 0, max(CAMERA.width, CAMERA.height), options.size)
+    return CAMERA.warped(whole.input_from_image, whole.size, whole.size)
 
 
 def _rows(root: Path, options: Options, sequence: int) -> dict[int, dict[str, str]]:

@@ -9,6 +9,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -79,7 +80,7 @@ def read_glb(path: Path) -> list[Surface]:
     return surfaces
 
 
-def _part(mesh: object, body_from_node: Float[ndarray, "4 4"]) -> Surface:
+def _part(mesh: Any, body_from_node: Float[ndarray, "4 4"]) -> Surface:
     linear = body_from_node[:3, :3]
     faces = np.asarray(mesh.faces)
     if np.linalg.det(linear) < 0:
@@ -93,7 +94,7 @@ def _part(mesh: object, body_from_node: Float[ndarray, "4 4"]) -> Surface:
         uv = np.asarray(uv, dtype=np.float64) * (1, -1) + (0, 1)  # trimesh puts the origin at the bottom
     colours = None
     if mesh.visual.kind in ("vertex", "face"):
-        colours = np.asarray(mesh.visual.to_color().vertex_colors)[:, :3] / 255.0
+        colours = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
     vertices = np.asarray(mesh.vertices) @ linear.T + body_from_node[:3, 3]
     return Surface(vertices, faces, normals, uv, colours, _material(mesh, colours is not None, uv is not None))
 
@@ -111,7 +112,7 @@ def _merged(parts: list[Surface]) -> Surface:
     return Surface(vertices, faces, joined("normals"), joined("uv"), joined("colours"), first.material)
 
 
-def _material(mesh: object, coloured: bool, mapped: bool) -> Material:
+def _material(mesh: Any, coloured: bool, mapped: bool) -> Material:
     source = getattr(mesh.visual, "material", None)
     if source is None:
         return Material(None if coloured else np.array(BARE_COLOUR), 0.0, 0.5)
@@ -132,7 +133,7 @@ def _material(mesh: object, coloured: bool, mapped: bool) -> Material:
     return Material(base_colour, metallic, np.maximum(roughness, SMALLEST_ROUGHNESS), normal)
 
 
-def _pixels(image: object) -> UInt8[ndarray, "h w 3"]:
+def _pixels(image: Any) -> UInt8[ndarray, "h w 3"]:
     return np.asarray(image.convert("RGB"))
 
 
@@ -148,12 +149,12 @@ def linear_from_srgb(values: UInt8[ndarray, "*n"]) -> Float[ndarray, "*n"]:
     return table.astype(np.float32)[values]
 
 
-def build_shapes(mi: ModuleType, surfaces: list[Surface]) -> dict[str, object]:
+def build_shapes(mi: ModuleType, surfaces: list[Surface]) -> dict[str, Any]:
     """Mitsuba meshes of the active variant by name, ready for `mi.load_dict`."""
     return {f"surface_{k}": _shape(mi, f"surface_{k}", surface) for k, surface in enumerate(surfaces)}
 
 
-def _shape(mi: ModuleType, name: str, surface: Surface) -> object:
+def _shape(mi: ModuleType, name: str, surface: Surface) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_bsdf(mi, surface.material))
     if surface.normals is None:
@@ -179,8 +180,8 @@ def _shape(mi: ModuleType, name: str, surface: Surface) -> object:
     return mesh
 
 
-def _bsdf(mi: ModuleType, material: Material) -> dict[str, object]:
-    principled: dict[str, object] = {
+def _bsdf(mi: ModuleType, material: Material) -> dict[str, Any]:
+    principled: dict[str, Any] = {
         "type": "principled",
         "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
         "metallic": _number(mi, material.metallic),
@@ -193,13 +194,13 @@ def _bsdf(mi: ModuleType, material: Material) -> dict[str, object]:
     return {"type": "twosided", "bsdf": principled}
 
 
-def _colour(mi: ModuleType, value: Float[ndarray, "..."]) -> dict[str, object]:
+def _colour(mi: ModuleType, value: Float[ndarray, "..."]) -> dict[str, Any]:
     return _texture(mi, value) if value.ndim == 3 else {"type": "rgb", "value": value.tolist()}
 
 
-def _number(mi: ModuleType, value: float | Float[ndarray, "h w 1"]) -> float | dict[str, object]:
+def _number(mi: ModuleType, value: float | Float[ndarray, "h w 1"]) -> float | dict[str, Any]:
     return _texture(mi, value) if isinstance(value, np.ndarray) and value.ndim == 3 else float(value)
 
 
-def _texture(mi: ModuleType, values: Float[ndarray, "h w c"]) -> dict[str, object]:
+def _texture(mi: ModuleType, values: Float[ndarray, "h w c"]) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values, dtype=np.float32)), "raw": True}

@@ -6,14 +6,7 @@ compiled again from frame to frame. Radiance 1.0 is a white Lambertian surface t
 
 from __future__ import annotations
 
-import functools
-import os
-import subprocess
-import sys
-import warnings
 from dataclasses import dataclass
-from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -21,21 +14,14 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
 from gknet.crop import Crop
-from gknet.errors import GknetError, MissingExtraError
+from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
-from gknet.render import film, shading
+from gknet.render import film
 from gknet.render.materials import build_shapes, read_glb
-from gknet.render.shading import Light, Region
+from gknet.render.scenario import EARTH_RADIUS_M, Shot
+from gknet.render.shading import Light, Region, Shader
+from gknet.render.variant import Engine, choose_variant, load_engine
 from gknet.spacecraft import Spacecraft
-
-if TYPE_CHECKING:
-    from gknet.render.scenario import Shot
-
-VARIANT_VARIABLE = "GKNET_MITSUBA_VARIANT"
-EARTH_RADIUS_M = 6.371e6
-EARTH_ALBEDO = (0.27, 0.30, 0.34)
-STARLIGHT = 0.002
-"""Radiance from every direction, so that no shadow is perfectly black."""
 
 OCCLUSION_TOLERANCE = 0.002
 """A keypoint is hidden by what is nearer than it by more than this part of the diameter (1 cm on 5 m)."""
@@ -59,54 +45,6 @@ class Rendered:
     visible: Bool[ndarray, "n"]
 
 
-@functools.cache
-def choose_variant() -> str:
-    """Mitsuba's variant for this machine: $GKNET_MITSUBA_VARIANT, else LLVM when it works, else scalar_rgb.
-
-    LLVM is tried in a process of its own, since a version that does not fit aborts the process.
-    """
-    chosen = os.environ.get(VARIANT_VARIABLE)
-    if chosen:
-        return chosen
-    if _works("llvm_ad_rgb"):
-        return "llvm_ad_rgb"
-    warnings.warn(
-        "rendering with scalar_rgb, many times slower: Mitsuba found no LLVM that works; "
-        "install one (Debian, Ubuntu: apt install libllvm19 or libllvm15)",
-        stacklevel=2,
-    )
-    return "scalar_rgb"
-
-
-def _works(variant: str) -> bool:
-    program = (
-        f"import mitsuba as mi; mi.set_variant({variant!r}); import drjit as dr\n"
-        "dr.eval(mi.render(mi.load_dict({'type': 'scene', 'ball': {'type': 'sphere'}, 'eye': {'type': 'perspective', "
-        "'film': {'type': 'hdrfilm', 'width': 8, 'height': 8}}, 'sky': {'type': 'constant'}}), spp=1)); dr.sync_thread()"
-    )
-    try:
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=120, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return done.returncode == 0
-
-
-def _mitsuba(variant: str) -> ModuleType:
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        raise MissingExtraError("render", "mitsuba") from error
-    if variant not in mi.variants() or not variant.endswith("_rgb"):
-        known = ", ".join(name for name in mi.variants() if name.endswith("_rgb"))
-        raise GknetError(f"variant: expected one of {known}, got '{variant}'")
-    if mi.variant() != variant:
-        try:
-            mi.set_variant(variant)
-        except (ImportError, RuntimeError) as error:
-            raise GknetError(f"variant: Mitsuba cannot run '{variant}' here ({error}); try scalar_rgb") from error
-    return mi
-
-
 class Renderer:
     """One spacecraft, loaded once, rendered from any pose.
 
@@ -127,46 +65,49 @@ class Renderer:
         self.spacecraft = spacecraft
         self.variant = variant or choose_variant()
         self.spp = spp
-        mi = _mitsuba(self.variant)
+        engine = load_engine(self.variant)
         if threads is not None:
-            import drjit
-
-            drjit.set_thread_count(threads)
+            engine.dr.set_thread_count(threads)
         self._hull_m = _hull(np.concatenate([surface.vertices_m for surface in surfaces]))
-        self._shapes = build_shapes(mi, surfaces)
-        self._scene = mi.load_dict({"type": "scene", **self._shapes})
+        self._shapes = build_shapes(engine.mi, surfaces)
+        self._scene = engine.mi.load_dict({"type": "scene", **self._shapes})
+        self._shader = None if engine.scalar else Shader(engine, self._scene, spp)
 
     def render(self, shot: Shot, window: Crop) -> Rendered:
         """The spacecraft in `window` of the shot's camera; the same shot gives the same bits."""
-        mi = _mitsuba(self.variant)
+        engine = load_engine(self.variant)
         camera = shot.camera.warped(window.input_from_image, window.size, window.size)
         _check_square(camera)
-        rgba, depth = self._picture(mi, shot, camera)
+        rgba, depth = self._picture(engine, shot, camera)
         points_cam = shot.cam_from_body.transform(self.spacecraft.points_m)
         visible = shot.camera.contains(shot.camera.project(points_cam))
         tolerance = OCCLUSION_TOLERANCE * self.spacecraft.diameter_m
-        unhidden = film.unhidden if self.variant.startswith("scalar") else shading.unhidden
-        visible &= unhidden(mi, self._scene, shot.cam_from_body.inverse(), points_cam, tolerance)
+        visible &= self._unhidden(engine, shot.cam_from_body.inverse(), points_cam, tolerance)
         return Rendered(rgba[..., :3], rgba[..., 3], depth > 0, depth, visible)
 
     def _picture(
-        self, mi: ModuleType, shot: Shot, camera: Camera
+        self, engine: Engine, shot: Shot, camera: Camera
     ) -> tuple[Float32[ndarray, "s s 4"], Float32[ndarray, "s s"]]:
+        """Premultiplied RGB with alpha, and depth."""
         body_from_cam, light = shot.cam_from_body.inverse(), light_of(shot)
-        if self.variant.startswith("scalar"):
-            sensor = film.sensor(mi, camera, body_from_cam)
-            rgba = film.radiance(mi, self._shapes, sensor, light, self.spp, shot.seed)
-            return rgba, film.depth(mi, self._scene, sensor, body_from_cam)
+        if self._shader is None:
+            sensor = film.sensor(engine, camera, body_from_cam)
+            rgba = film.radiance(engine, self._shapes, sensor, light, self.spp, shot.seed)
+            return rgba, film.depth(engine, self._scene, sensor, body_from_cam)
         rgba = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
         depth = np.zeros((camera.height, camera.width), dtype=np.float32)
         region = region_of(camera, shot.cam_from_body.transform(self._hull_m))
         if region is not None:
-            rows, columns = region.slices
-            rgba[rows, columns] = shading.radiance(
-                mi, self._scene, camera, body_from_cam, region, light, self.spp, shot.seed
-            )
-            depth[rows, columns] = shading.depth(mi, self._scene, camera, body_from_cam, region)
+            rgba[region.slices] = self._shader.radiance(camera, body_from_cam, region, light, shot.seed)
+            depth[region.slices] = self._shader.depth(camera, body_from_cam, region)
         return rgba, depth
+
+    def _unhidden(
+        self, engine: Engine, body_from_cam: Pose, points_cam: Float[ndarray, "n 3"], tolerance_m: float
+    ) -> Bool[ndarray, "n"]:
+        if self._shader is None:
+            return film.unhidden(engine, self._scene, body_from_cam, points_cam, tolerance_m)
+        return self._shader.unhidden(body_from_cam, points_cam, tolerance_m)
 
 
 def light_of(shot: Shot) -> Light:
@@ -174,12 +115,13 @@ def light_of(shot: Shot) -> Light:
     rotation = shot.cam_from_body.rotation
     sun = np.asarray(shot.sun_direction, dtype=np.float64)
     centre = None
-    if shot.earth is not None:
-        # The Earth is a sphere whose direction is the same for all parts of the spacecraft.
-        centre = (shot.earth.centre_cam_m - shot.cam_from_body.translation_m) @ rotation / EARTH_RADIUS_M
+    earth = shot.planet or shot.earth
+    if earth is not None:
+        # It looks the same from all parts of the spacecraft.
+        centre = (earth.centre_cam_m - shot.cam_from_body.translation_m) @ rotation / EARTH_RADIUS_M
         if centre @ centre <= 1:
             raise GknetError(f"shot: the spacecraft is inside the Earth ({np.linalg.norm(centre):.4f} radii away)")
-    return Light(sun / np.linalg.norm(sun) @ rotation, STARLIGHT, EARTH_ALBEDO, centre)
+    return Light(sun / np.linalg.norm(sun) @ rotation, centre)
 
 
 def region_of(camera: Camera, hull_cam_m: Float[ndarray, "v 3"]) -> Region | None:

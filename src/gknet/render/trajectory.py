@@ -43,13 +43,13 @@ def relative_transition(rate: float, time_s: Times) -> Float[ndarray, "t 6 6"]:
     return phi
 
 
-def approach(
-    rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Float[ndarray, "3"]
-) -> Path:
+def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Float[ndarray, "3"]) -> Path:
     """The free flight from `start_m` at the first time to `end_m` at the last."""
     elapsed = time_s - time_s[0]
     if not 0 < rate * elapsed[-1] < np.pi:
-        raise GknetError(f"approach: expected less than half an orbit, got {rate * elapsed[-1] / (2 * np.pi):.2f} orbits")
+        raise GknetError(
+            f"approach: expected less than half an orbit, got {rate * elapsed[-1] / (2 * np.pi):.2f} orbits"
+        )
     phi = relative_transition(rate, elapsed)
     velocity = np.linalg.solve(phi[-1, :3, 3:], end_m - phi[-1, :3, :3] @ start_m)
     return phi[:, :3] @ np.concatenate([start_m, velocity])
@@ -75,7 +75,7 @@ def hold(time_s: Times, point_m: Float[ndarray, "3"], slack: float, rng: np.rand
 
 def band_limited(time_s: Times, rng: np.random.Generator, periods_s: tuple[float, float]) -> Times:
     """A smooth random process in [-1, 1]: five sines with periods in the band and random phases."""
-    periods = np.exp(rng.uniform(*np.log(periods_s), size=5))
+    periods = np.exp(rng.uniform(np.log(periods_s[0]), np.log(periods_s[1]), size=5))
     weights = rng.dirichlet(np.full(5, 2.0))
     phases = rng.uniform(0, 2 * np.pi, size=5)
     return np.sin(2 * np.pi * np.asarray(time_s)[:, None] / periods + phases) @ weights
@@ -125,6 +125,11 @@ def orbit_frames(rate: float, time_s: Times, plane: Float[ndarray, "3 3"]) -> Fl
     """inertial_from_lvlh at each time; the columns of `plane` are LVLH's axes in the inertial frame at time 0."""
     turns = Rotation.from_rotvec(rate * np.asarray(time_s)[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
     return plane @ turns
+
+
+def random_rotation(rng: np.random.Generator) -> Rotation:
+    """Uniform on the rotations."""
+    return Rotation.from_quat(rng.standard_normal(4))
 
 
 def random_direction(rng: np.random.Generator) -> Float[ndarray, "3"]:

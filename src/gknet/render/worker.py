@@ -72,18 +72,21 @@ class Studio:
 def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: Crop) -> Picture:
     """The picture of `window` as the sensor gives it: black beyond its edge, as where a crop leaves an image."""
     rendered = renderer.render(shot, window)
-    scenery = background(shot, window)
-    radiance = rendered.radiance + (1 - rendered.alpha[..., None]) * scenery
+    radiance = background(shot, window)
+    radiance *= (1 - rendered.alpha)[..., None]
+    radiance += rendered.radiance
     rgb = expose(radiance, shot.sensor, window.scale, shot.seed)
+    mask, depth_m = rendered.mask, rendered.depth_m
     inside = _on_sensor(window, shot.camera)
-    visible = rendered.visible & shot.camera.contains(
-        shot.camera.project(shot.cam_from_body.transform(spacecraft.points_m))
-    )
+    if not inside.all():
+        rgb = np.where(inside[..., None], rgb, np.uint8(0))
+        mask, depth_m = mask & inside, np.where(inside, depth_m, np.float32(0))
+    pixels = shot.camera.project(shot.cam_from_body.transform(spacecraft.points_m))
     return Picture(
-        rgb=np.where(inside[..., None], rgb, np.uint8(0)),
-        mask=rendered.mask & inside,
-        depth_m=np.where(inside, rendered.depth_m, 0).astype(np.float32),
-        visible=visible,
+        rgb=rgb,
+        mask=mask,
+        depth_m=depth_m,
+        visible=rendered.visible & shot.camera.contains(pixels),
         camera=shot.camera.warped(window.input_from_image, window.size, window.size),
     )
 
@@ -147,8 +150,8 @@ def _reason(sequence: int, index: int, error: Exception) -> str:
 
 
 def append_row(journal: Path, row: dict[str, str]) -> None:
-    """Append a row in one write, so that two processes and a kill leave whole lines (but for the last)."""
-    line = json.dumps(row) + "\n"
+    """Append a row in one write. A line starts with its newline, so that one cut off by a kill spoils no other."""
+    line = "\n" + json.dumps(row)
     handle = os.open(journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
         os.write(handle, line.encode("utf-8"))

@@ -28,16 +28,17 @@ def enlarged(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"],
 class Canvas:
     """Draws in place on `image`; coordinates are pixels whose top-left centre is (0.5, 0.5), times `factor`.
 
-    Widths and sizes are in units of 1/1024 of the image's longer side.
+    Widths and sizes are in units of 1/1024 of the image's longer side, times `weight`.
     """
 
     image: UInt8[ndarray, "h w 3"]
     factor: int = 1
+    weight: float = 1.0
     _font: cv2.FontFace = field(default_factory=lambda: cv2.FontFace("sans"))
 
     @property
     def unit(self) -> float:
-        return max(self.image.shape[:2]) / 1024
+        return self.weight * max(self.image.shape[:2]) / 1024
 
     def _fixed(self, point: Float[ndarray, "2"]) -> tuple[int, int]:
         x, y = (np.asarray(point) * self.factor - 0.5) * (1 << _SHIFT)

@@ -116,8 +116,11 @@ def _scale(axis: Axis, values: Sequence[Float[ndarray, "*k"]], start: float, end
         raise GknetError(f"axis '{axis.label}': a logarithmic axis starts above 0, got {low}")
     if high <= low:
         low, high = (low / 2, low * 2) if axis.log else (low - 0.5, low + 0.5)
+    room = 1.15 if axis.log else 0.05 * (high - low)
     if axis.high is None:
-        high = high * 1.15 if axis.log else high + 0.06 * (high - low)
+        high = high * room if axis.log else high + room
+    if axis.low is None:
+        low = low / room if axis.log else low - room
     return _Scale(axis, low, high, start, end)
 
 
@@ -126,7 +129,7 @@ def _linear_ticks(low: float, high: float) -> list[float]:
     power = 10.0 ** np.floor(np.log10(rough))
     step = power * next(m for m in (1, 2, 2.5, 5, 10) if m * power >= rough)
     first = np.ceil(low / step - 1e-9)
-    return [float(k * step) for k in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+    return [float(k * step) + 0.0 for k in np.arange(first, np.floor(high / step + 1e-9) + 1)]
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
@@ -166,7 +169,8 @@ def _vertical_grid(across: _Scale, top: float, bottom: float) -> str:
 
 def _legend(names: Sequence[str]) -> str:
     """Right-aligned in the title's line; one unnamed series needs none."""
-    parts, x = [], _WIDTH - _RIGHT
+    parts: list[str] = []
+    x = float(_WIDTH - _RIGHT)
     for k in reversed(range(len(names))):
         if not names[k]:
             continue
@@ -197,7 +201,8 @@ def _bar(k: int, series: Series, row: int, across: _Scale, top: float, thick: fl
     if not np.isfinite(value):
         return ""
     width = max(0.5, across(value) - across.start)
-    bar = f'<rect class="fill s{k}" x="{across.start:.1f}" y="{top:.1f}" width="{width:.1f}" height="{thick:.1f}" rx="2"/>'
+    place = f'x="{across.start:.1f}" y="{top:.1f}" width="{width:.1f}" height="{thick:.1f}"'
+    bar = f'<rect class="fill s{k}" {place} rx="2"/>'
     if series.low is None or series.high is None:
         return bar
     middle, low, high = top + thick / 2, across(series.low[row]), across(series.high[row])

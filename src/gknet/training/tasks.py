@@ -1,0 +1,77 @@
+"""What is trained: keypoints or the locator. A task draws samples, computes the loss and validates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gknet.frame import Frame
+from gknet.network.gknet import Branches
+from gknet.spacecraft import Spacecraft
+from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
+from gknet.training.loss import gaussian_targets, heatmap_loss, locator_loss
+from gknet.training.validation import Validation, validate_keypoints, validate_locator
+
+
+class Task(Protocol):
+    @property
+    def draw(self) -> Draw: ...
+
+    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]: ...
+    def validate(
+        self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
+    ) -> Validation: ...
+
+
+@dataclass(frozen=True)
+class KeypointTask:
+    """Heatmaps against Gaussians; `auxiliary` is the weight of each branch's own loss."""
+
+    spacecraft: Spacecraft
+    stride: int
+    input_size: int
+    sigma_cells: float
+    auxiliary: float
+    draw: Draw = draw_keypoints
+
+    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
+        branches: Branches = network.branches(batch.network_input(device))  # type: ignore[operator]
+        height, width = branches.heatmaps.shape[2:]
+        points, weight = batch.points_px.to(device), batch.weight.to(device)
+        targets = gaussian_targets(points, self.stride, height, width, self.sigma_cells)
+        loss = heatmap_loss(branches.heatmaps, targets, weight)
+        if self.auxiliary > 0 and branches.nodes is not None:
+            parts = heatmap_loss(branches.pixels, targets, weight) + heatmap_loss(branches.nodes, targets, weight)
+            loss = loss + self.auxiliary * parts
+        return loss
+
+    def validate(
+        self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
+    ) -> Validation:
+        return validate_keypoints(network, device, frames, rows, self.spacecraft, self.input_size)
+
+
+@dataclass(frozen=True)
+class LocatorTask:
+    """The box's centre and sides in the whole picture."""
+
+    spacecraft: Spacecraft
+    stride: int
+    input_size: int
+    sigma_cells: float
+    draw: Draw = draw_box
+
+    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
+        output = network(batch.network_input(device))
+        corners, weight = batch.points_px.to(device), batch.weight.to(device)
+        return locator_loss(output, corners, weight, self.stride, self.sigma_cells)
+
+    def validate(
+        self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
+    ) -> Validation:
+        return validate_locator(network, device, frames, rows, self.spacecraft, self.input_size)

@@ -1,0 +1,123 @@
+"""Validation runs the deployed code: crop, decode and pose in numpy; only the network is torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from numpy import ndarray
+from torch import nn
+
+from gknet import metrics
+from gknet.errors import GknetError
+from gknet.estimator import Estimator, Looking
+from gknet.frame import Frame, Keypoints
+from gknet.spacecraft import Spacecraft
+
+UNFOUND_COVARIANCE_SCALE = 1.0
+"""Where no keypoint was sure enough to measure it."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """`score` decides which weights are the best: lower is better. `values` are what the tables show."""
+
+    score: float
+    values: dict[str, float]
+
+
+def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray], ndarray]:
+    """A torch network as the estimator sees networks: numpy in, numpy out, in float32."""
+
+    def run(images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "b c h w"]:
+        with torch.inference_mode():
+            batch = torch.from_numpy(images).to(device).contiguous(memory_format=torch.channels_last)
+            return network(batch).float().cpu().numpy()
+
+    return run
+
+
+def _usable(frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft) -> list[Frame]:
+    """The frames that can be read and that show the craft."""
+    usable = []
+    for row in rows:
+        try:
+            frame = frames[row]
+            metrics.oracle_crop(frame, spacecraft)
+        except GknetError:
+            continue
+        usable.append(frame)
+    if not usable:
+        raise GknetError("validation: no frame of the val split can be read and shows the spacecraft")
+    return usable
+
+
+def validation_rows(count: int, wanted: int) -> list[int]:
+    """At most `wanted` rows, evenly spread over the split, the same ones every time."""
+    return sorted({int(row) for row in np.linspace(0, count - 1, min(count, wanted)).round()})
+
+
+def validate_keypoints(
+    network: nn.Module,
+    device: torch.device,
+    frames: Sequence[Frame],
+    rows: Sequence[int],
+    spacecraft: Spacecraft,
+    input_size: int,
+) -> Validation:
+    """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
+    network.eval()
+    estimator = Estimator(
+        numpy_network(network, device), spacecraft, looking=Looking(input_size=input_size, refine_crop=False)
+    )
+    errors: list[metrics.FrameErrors] = []
+    pairs: list[tuple[Keypoints, Frame]] = []
+    for frame in _usable(frames, rows, spacecraft):
+        assert frame.image is not None
+        box = frame.true_box(spacecraft.points_m)
+        estimate = estimator.estimate(frame.image, frame.camera, box)
+        errors.append(metrics.errors(frame, estimate, spacecraft))
+        if estimate.keypoints is not None:
+            pairs.append((estimate.keypoints, frame))
+    try:
+        scale = metrics.covariance_scale(pairs, spacecraft)
+    except GknetError:
+        scale = UNFOUND_COVARIANCE_SCALE
+    values = {
+        "rmse_px": float(np.mean([error.rmse_px for error in errors])),
+        "median_px": float(np.median([error.rmse_px for error in errors])),
+        "pck_5": float(np.mean([error.pck_5 for error in errors])),
+        "e_t": float(np.mean([error.e_t for error in errors])),
+        "e_q_rad": float(np.mean([error.e_q_rad for error in errors])),
+        "failures": float(np.mean([error.failure is not None for error in errors])),
+        "covariance_scale": scale,
+    }
+    return Validation(values["rmse_px"], values)
+
+
+def validate_locator(
+    network: nn.Module,
+    device: torch.device,
+    frames: Sequence[Frame],
+    rows: Sequence[int],
+    spacecraft: Spacecraft,
+    input_size: int,
+) -> Validation:
+    """Overlap of the located with the true boxes; the score is 1 minus the part that reaches 0.7, plus the mean gap."""
+    network.eval()
+    run = numpy_network(network, device)
+    estimator = Estimator(run, spacecraft, locator=run, looking=Looking(input_size=input_size))
+    overlaps = []
+    for frame in _usable(frames, rows, spacecraft):
+        assert frame.image is not None
+        true_box, found = frame.true_box(spacecraft.points_m), estimator.locate(frame.image)
+        overlaps.append(0.0 if found is None or true_box is None else found.iou(true_box))
+    values = {
+        "iou": float(np.mean(overlaps)),
+        "iou_07": float(np.mean(np.array(overlaps) >= 0.7)),
+        "iou_085": float(np.mean(np.array(overlaps) >= 0.85)),
+    }
+    return Validation(1 - values["iou_07"] + 0.1 * (1 - values["iou"]), values)

@@ -1,0 +1,328 @@
+"""`gknet predict`: what it writes for good input, and how it refuses the rest."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gknet.cli.main import run
+from gknet.image import read_image, write_image
+from gknet.video import VideoWriter, open_video
+from tests.cli.toy import FOCAL_PX, SIZE, ToyEstimator, toy_picture, toy_pose
+
+Use = Callable[[ToyEstimator], None]
+Refused = Callable[..., str]
+LENS = ("--focal-px", str(FOCAL_PX))
+MODEL = ("--spacecraft", "toycraft")
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    folder = tmp_path / "pictures"
+    (folder / "deep").mkdir(parents=True)
+    for number, name in enumerate(("a.jpg", "b.png", "deep/c.jpg")):
+        write_image(folder / name, toy_picture(number))
+    return folder
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    path = tmp_path / "film.mp4"
+    with VideoWriter(path, 5) as writer:
+        for number in range(6):
+            writer.write(toy_picture(number))
+    return path
+
+
+def predict(*arguments: object) -> int:
+    return run(["predict", *(str(argument) for argument in arguments)])
+
+
+def records(out: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (out / "poses.jsonl").read_text().splitlines()]
+
+
+def leftovers(out: Path) -> list[Path]:
+    return [path for path in out.rglob("*") if path.is_file()] if out.exists() else []
+
+
+def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(pictures / "a.jpg", *MODEL, *LENS, "--out", out) == 0
+    (record,) = records(out)
+    truth = toy_pose(0)
+    assert (record["name"], record["status"], record["failure"]) == ("a.jpg", "ok", None)
+    assert np.allclose(record["translation_m"], truth.translation_m, rtol=1e-8)
+    assert np.allclose(record["quaternion_wxyz"], truth.quaternion_wxyz, atol=1e-8)
+    assert np.shape(record["covariance"]) == (6, 6)
+    assert record["inlier_count"] == len(record["keypoints"]) == 13
+    assert record["keypoints"][12]["name"] == "mast"
+    overlay = read_image(out / "overlays" / "a.jpg")
+    assert max(overlay.shape) == 3 * SIZE
+    assert sorted(path.name for path in leftovers(out)) == ["a.jpg", "poses.jsonl"]
+
+
+def test_folder_goes_on_past_bad_pictures(
+    use: Use, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use(ToyEstimator(blind=frozenset({1})))
+    data = (pictures / "a.jpg").read_bytes()
+    (pictures / "half.jpg").write_bytes(data[: len(data) // 2])
+    (pictures / "text.png").write_text("no picture")
+    out = tmp_path / "out"
+    assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
+    status = {record["name"]: record["status"] for record in records(out)}
+    assert status == {
+        "a.jpg": "ok",
+        "b.png": "no pose",
+        "deep/c.jpg": "ok",
+        "half.jpg": "unreadable",
+        "text.png": "unreadable",
+    }
+    words = capsys.readouterr().out
+    assert "2 of 5 pictures have a pose, 3 failed" in words
+    assert "truncated" in words
+    assert (out / "overlays" / "deep_c.jpg").exists()
+
+
+def test_csv_says_the_same_as_jsonl(use: Use, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator(error=1.0, blind=frozenset({1})))
+    out = tmp_path / "out"
+    for layout in ("jsonl", "csv"):
+        assert predict(pictures, *MODEL, *LENS, "--out", out, "--format", layout, "--no-overlay") == 0
+    with open(out / "poses.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, record in zip(rows, records(out), strict=True):
+        assert (row["name"], row["status"], row["failure"]) == (
+            record["name"],
+            record["status"],
+            record["failure"] or "",
+        )
+        if record["status"] == "ok":
+            assert [float(row[key]) for key in ("tx_m", "ty_m", "tz_m")] == record["translation_m"]
+            assert [float(row[key]) for key in ("qw", "qx", "qy", "qz")] == record["quaternion_wxyz"]
+            assert float(row["covariance_35"]) == record["covariance"][3][5]
+            assert float(row["mast_x"]) == record["keypoints"][12]["pixel"][0]
+        else:
+            assert row["tx_m"] == row["mast_score"] == ""
+    assert not (out / "overlays").exists()
+
+
+def test_video_in_and_out(use: Use, film: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(film, *MODEL, *LENS, "--out", out, "--video", "--every", 2) == 0
+    found = records(out)
+    assert [record["name"] for record in found] == ["film/000000", "film/000002", "film/000004"]
+    assert [record["time_s"] for record in found] == pytest.approx([0, 0.4, 0.8])
+    assert np.allclose(found[2]["translation_m"], toy_pose(4).translation_m, rtol=1e-8)
+    video = open_video(out / "overlay.mp4")
+    assert (video.announced, video.width, video.fps) == (3, 3 * SIZE, 2.5)
+
+
+def test_dataset_brings_its_camera_and_truth(use: Use, dataset: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(dataset, *MODEL, "--oracle", "--split", "test", "--every", 2, "--out", out) == 0
+    found = records(out)
+    assert [record["name"] for record in found] == [f"00000{s}/00000{i}" for s in (1, 2) for i in (1, 3, 5)]
+    assert all(record["status"] == "ok" for record in found)
+
+
+def test_dataset_passes_over_a_lost_image(use: Use, tmp_path: Path) -> None:
+    from tests.cli.toy import write_toy_dataset
+
+    use(ToyEstimator())
+    root = write_toy_dataset(tmp_path / "set", sequences=1, frames=3)
+    (root / "data" / "000001" / "image" / "000002.jpg").unlink()
+    out = tmp_path / "out"
+    assert predict(root, *MODEL, "--out", out) == 0
+    assert [record["status"] for record in records(out)] == ["ok", "unreadable", "ok"]
+
+
+def test_box_is_used(use: Use, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(pictures / "a.jpg", *MODEL, *LENS, "--box", "10,20,200,210.5", "--out", out) == 0
+    assert records(out)[0]["box"] == [10, 20, 200, 210.5]
+
+
+def test_no_pose_at_all_is_two_but_is_recorded(use: Use, refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator(blind=frozenset({0})))
+    out = tmp_path / "out"
+    line = refused("predict", pictures / "a.jpg", *MODEL, *LENS, "--out", out)
+    assert "no pose in any of 1 pictures; the first, a.jpg: the locator sees no spacecraft" in line
+    assert records(out)[0]["failure"] == "the locator sees no spacecraft"
+
+
+CAMERA_TEXTS = {
+    "not JSON": ("camera.json", "{", "not valid JSON"),
+    "a list": ("camera.json", "[1, 2]", "expected a JSON object"),
+    "unknown key": (
+        "camera.json",
+        '{"matrix": [[1,0,0],[0,1,0],[0,0,1]], "width": 9, "height": 9, "f": 1}',
+        "unknown key f",
+    ),
+    "missing key": ("camera.json", '{"matrix": [[1,0,0],[0,1,0],[0,0,1]], "width": 9}', "missing height"),
+    "2 x 3": ("camera.json", '{"matrix": [[1,0,0],[0,1,0]], "width": 9, "height": 9}', "expected shape (3, 3)"),
+    "ragged": ("camera.json", '{"matrix": [[1,0],[0,1,0]], "width": 9, "height": 9}', "camera matrix"),
+    "NaN": ("camera.json", '{"matrix": [[NaN,0,4],[0,9,4],[0,0,1]], "width": 9, "height": 9}', "NaN"),
+    "words": ("camera.json", '{"matrix": "K", "width": 9, "height": 9}', "camera matrix"),
+    "half a pixel": ("camera.json", '{"matrix": [[9,0,4],[0,9,4],[0,0,1]], "width": 9.5, "height": 9}', "width"),
+    "other size": ("camera.json", '{"matrix": [[9,0,4],[0,9,4],[0,0,1]], "width": 9, "height": 9}', "256 x 256"),
+    "text 2 x 3": ("camera_matrix.txt", "1, 2, 3\n4, 5, 6\n", "3 x 3"),
+    "text words": ("camera_matrix.txt", "a, b, c\n1, 2, 3\n1, 2, 3\n", "numbers"),
+    "text NaN": ("camera_matrix.txt", "nan, 0, 1\n0, 1, 1\n0, 0, 1\n", "finite"),
+}
+
+
+@pytest.mark.parametrize("case", CAMERA_TEXTS)
+def test_bad_cameras(case: str, use: Use, refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    name, text, words = CAMERA_TEXTS[case]
+    (tmp_path / name).write_text(text)
+    out = tmp_path / "out"
+    assert words in refused("predict", pictures / "a.jpg", *MODEL, "--camera", tmp_path / name, "--out", out)
+
+
+BAD_OPTIONS = {
+    "no camera": ((*MODEL,), "--focal-px"),
+    "two cameras": ((*MODEL, *LENS, "--hfov-deg", "30"), "one of the three"),
+    "missing camera file": ((*MODEL, "--camera", "none.json"), "none.json"),
+    "negative focal": ((*MODEL, "--focal-px", "-3"), "focal length"),
+    "NaN focal": ((*MODEL, "--focal-px", "nan"), "focal length"),
+    "wide field": ((*MODEL, "--hfov-deg", "181"), "field of view"),
+    "no model": (LENS, "--spacecraft NAME"),
+    "two models": ((*MODEL, "--model", "here", *LENS), "--spacecraft NAME"),
+    "three numbers": ((*MODEL, *LENS, "--box", "1,2,3"), "--box"),
+    "words": ((*MODEL, *LENS, "--box", "a,b,c,d"), "--box"),
+    "empty box": ((*MODEL, *LENS, "--box", "10,10,5,20"), "x0 < x1"),
+    "NaN box": ((*MODEL, *LENS, "--box", "nan,10,5,20"), "box"),
+    "box and oracle": ((*MODEL, *LENS, "--box", "1,2,3,4", "--oracle"), "one of the two"),
+    "oracle without truth": ((*MODEL, *LENS, "--oracle"), "true poses"),
+    "every 0": ((*MODEL, *LENS, "--every", "0"), "every"),
+    "no threads": ((*MODEL, *LENS, "--threads", "0"), "--threads"),
+    "unknown layout": ((*MODEL, *LENS, "--format", "xml"), "xml"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_OPTIONS)
+def test_bad_options(case: str, use: Use, refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    options, words = BAD_OPTIONS[case]
+    out = tmp_path / "out"
+    assert words in refused("predict", pictures / "a.jpg", *options, "--out", out)
+    assert leftovers(out) == []
+
+
+def test_bad_inputs(use: Use, refused: Refused, pictures: Path, film: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    whole = (pictures / "a.jpg").read_bytes()
+    (tmp_path / "half.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "words.jpg").write_text("no picture")
+    (tmp_path / "words.mp4").write_text("no video")
+    (tmp_path / "cut.mp4").write_bytes(film.read_bytes()[:300])
+    (tmp_path / "nothing").mkdir()
+    cases = {
+        "missing.jpg": "no such image",
+        "half.jpg": "truncated",
+        "empty.jpg": "empty",
+        "words.jpg": "expected an image",
+        "words.mp4": "video",
+        "cut.mp4": "video",
+        "nothing": "no image in this folder",
+    }
+    for name, words in cases.items():
+        assert words in refused("predict", tmp_path / name, *MODEL, *LENS, "--out", out), name
+
+
+def test_video_without_frames(use: Use, refused: Refused, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    path = tmp_path / "hollow.avi"
+    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5, (64, 64)).release()
+    assert "video" in refused("predict", path, *MODEL, *LENS, "--out", tmp_path / "out")
+
+
+def test_unknown_spacecraft(refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    line = refused("predict", pictures / "a.jpg", "--spacecraft", "satellite_99", *LENS, "--out", tmp_path / "out")
+    assert "satellite_99" in line
+    line = refused("predict", pictures / "a.jpg", "--model", tmp_path, *LENS, "--out", tmp_path / "out")
+    assert "keypoints.onnx" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("test.json", "{", "cannot read the split file"),
+        ("test.json", '["data/000001"]', "expected"),
+        ("data/000001/annotations.csv", "category,position\n", "orientation"),
+        ("data/000001/annotations.csv", "category,position,orientation\nToycraft,[1,2,3]\n", "cells"),
+        ("data/000001/keypoints.txt", "1, 2\n", "three"),
+        ("data/000001/camera_matrix.txt", "1, 2, 3\n4, 5, 6\n", "3 x 3"),
+        ("spacecraft/toycraft.toml", "name = ", "not valid TOML"),
+        ("spacecraft/toycraft.toml", 'name = "toycraft"\nmass = 3\n', "toycraft.toml"),
+    ],
+)
+def test_bad_datasets(name: str, text: str, words: str, use: Use, refused: Refused, tmp_path: Path) -> None:
+    from tests.cli.toy import write_toy_dataset
+
+    use(ToyEstimator())
+    root = write_toy_dataset(tmp_path / "set", sequences=1, frames=1)
+    (root / name).write_text(text)
+    out = tmp_path / "out"
+    assert words in refused("predict", root, *MODEL, "--out", out)
+    assert leftovers(out) == []
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, error: BaseException, picture: int) -> None:
+    """Raise inside the estimator at a picture."""
+    honest = ToyEstimator.estimate
+    seen = []
+
+    def estimate(self: ToyEstimator, *arguments: object) -> object:
+        seen.append(1)
+        if len(seen) > picture:
+            raise error
+        return honest(self, *arguments)
+
+    monkeypatch.setattr(ToyEstimator, "estimate", estimate)
+
+
+def test_interrupt_leaves_nothing_half_written(
+    use: Use, refused: Refused, film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(ToyEstimator())
+    stop_at(monkeypatch, KeyboardInterrupt(), 2)
+    out = tmp_path / "out"
+    refused("predict", film, *MODEL, *LENS, "--video", "--out", out, code=130)
+    assert [path.parent.name for path in leftovers(out)] == ["overlays", "overlays"]
+
+
+def test_full_disk_leaves_nothing_half_written(
+    use: Use, refused: Refused, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(ToyEstimator())
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gknet.prediction.write_image", full)
+    out = tmp_path / "out"
+    assert "No space left" in refused("predict", pictures, *MODEL, *LENS, "--video", "--out", out)
+    assert leftovers(out) == []
+
+
+def test_out_is_a_file(use: Use, refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    (tmp_path / "out").write_text("here")
+    assert "out" in refused("predict", pictures, *MODEL, *LENS, "--out", tmp_path / "out")

@@ -1,0 +1,145 @@
+"""Render, train, export, predict and evaluate on the command line; the result must beat two stated dumb baselines.
+
+The recipe is an easy one (near, well lit, no Earth, all keypoints in view) and the training is about a minute, so this
+shows that the rooms fit together and that training learns; how good gknet is, is measured elsewhere.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy import ndarray
+
+from gknet.dataset.skd import SkdDataset
+from gknet.metrics import oracle_crop
+
+pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+pytestmark = pytest.mark.slow
+
+CRAFT = "satellite_01"
+RECIPE = Path(__file__).parent / "easy.toml"
+CHANCE_E_Q_RAD = np.pi / 2 + 2 / np.pi
+"""The mean angle between a fixed attitude and one drawn at random: 2.21 rad."""
+
+
+def gknet(*words: object, code: int = 0) -> str:
+    """One command line in a process of its own; its standard output."""
+    command = [sys.executable, "-m", "gknet.cli.main", *map(str, words)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    run = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
+    assert run.returncode == code, f"{' '.join(command)}\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
+    return run.stdout if code == 0 else run.stderr
+
+
+@dataclass(frozen=True)
+class Products:
+    crops: Path
+    frames: Path
+    model: Path
+
+
+@pytest.fixture(scope="module")
+def products(tmp_path_factory: pytest.TempPathFactory) -> Products:
+    """Crops for the keypoints, small whole frames for the locator and the test; both networks trained and exported."""
+    root = tmp_path_factory.mktemp("e2e")
+    crops, frames, model = root / "crops", root / "frames", root / "model"
+    render = ("--recipe", RECIPE, "--spp", 4)
+    gknet("render", crops, *render, "--window", "target", "--size", 128, "--split", "train")
+    gknet("render", crops, *render, "--window", "target", "--size", 128, "--split", "val", "--every", 8)
+    gknet("render", frames, *render, "--size", 256, "--every", 5)
+    train = ("--spacecraft", CRAFT, "--val-frames", 24, "--validations", 2)
+    gknet("train", crops, *train, "--out", root / "keypoints", "--epochs", 12, "--stages", "0.6:96:16,0.4:128:16")
+    gknet("train", frames, *train, "--out", root / "locator", "--network", "locator", "--epochs", 12, "--batch", 8)
+    gknet("export", root / "keypoints", "--out", model)
+    gknet("export", root / "locator", "--out", model)
+    return Products(crops, frames, model)
+
+
+def keypoints_in_crop(dataset: SkdDataset, i: int) -> ndarray:
+    """(n, 2) in pixels of the 256 oracle crop, NaN where out of view."""
+    frame = dataset.frame(i, image=False)
+    pixels = frame.keypoints_px(dataset.spacecraft.points_m)
+    inside = frame.camera.contains(pixels)
+    return np.where(inside[:, None], oracle_crop(frame, dataset.spacecraft).to_input(pixels), np.nan)
+
+
+def constant_rmse_px(products: Products) -> float:
+    """Mean RMSE of the predictor that puts each keypoint where it is on average over the training crops."""
+    train = SkdDataset(products.crops, "train", CRAFT)
+    test = SkdDataset(products.frames, "test", CRAFT)
+    mean = np.nanmean([keypoints_in_crop(train, i) for i in range(len(train))], axis=0)
+    squared = [((keypoints_in_crop(test, i) - mean) ** 2).sum(axis=1) for i in range(len(test))]
+    return float(np.mean([np.sqrt(np.nanmean(row)) for row in squared]))
+
+
+@pytest.fixture(scope="module")
+def metrics(products: Products) -> dict[str, dict[str, dict[str, float]]]:
+    """Metric -> statistics, for each protocol."""
+    out = products.model.parent / "evaluation"
+    gknet("eval", products.frames, "--model", products.model, "--split", "test", "--out", out, "--pictures", 2)
+    assert (out / "report.html").stat().st_size > 10_000
+    content = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    return {protocol: run["metrics"] for protocol, run in content["runs"].items()}
+
+
+def test_keypoints_beat_the_constant_predictor(
+    products: Products, metrics: dict[str, dict[str, dict[str, float]]]
+) -> None:
+    baseline, found = constant_rmse_px(products), metrics["oracle"]["rmse_px"]["mean"]
+    print(f"RMSE, oracle crop: {found:.1f} px, constant predictor {baseline:.1f} px")
+    assert found < 0.6 * baseline
+
+
+def test_attitudes_beat_chance(metrics: dict[str, dict[str, dict[str, float]]]) -> None:
+    """Failures count as pi."""
+    for protocol in ("oracle", "detected"):
+        found = metrics[protocol]["e_q_rad"]["mean"]
+        print(f"E_q, {protocol} crop: {found:.2f} rad, chance {CHANCE_E_Q_RAD:.2f} rad")
+        assert found < 0.75 * CHANCE_E_Q_RAD
+
+
+def test_locator_finds_the_spacecraft(metrics: dict[str, dict[str, dict[str, float]]]) -> None:
+    assert metrics["detected"]["locator_iou"]["mean"] > 0.5
+
+
+def test_prediction_writes_a_line_for_each_picture(products: Products, tmp_path: Path) -> None:
+    dataset = SkdDataset(products.frames, "test", CRAFT)
+    out = tmp_path / "predictions"
+    gknet("predict", products.frames, "--model", products.model, "--split", "test", "--out", out)
+    lines = [json.loads(line) for line in (out / "poses.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert [line["name"] for line in lines] == [dataset.frame(i, image=False).name for i in range(len(dataset))]
+    posed = [line for line in lines if line["status"] == "ok"]
+    assert posed
+    assert all(np.linalg.norm(line["quaternion_wxyz"]) == pytest.approx(1, abs=1e-6) for line in posed)
+    assert len(list((out / "overlays").glob("*.jpg"))) == len(lines)
+
+
+def test_rendering_again_changes_nothing(products: Products) -> None:
+    annotations = sorted(products.frames.glob("data/*/annotations.csv"))
+    before = [path.read_bytes() for path in annotations]
+    said = gknet("render", products.frames, "--recipe", RECIPE, "--spp", 4, "--size", 256, "--every", 5)
+    assert " 0 frames rendered" in said or ": 0 frames rendered" in said
+    assert [path.read_bytes() for path in annotations] == before
+
+
+def test_bad_input_ends_with_one_line_and_code_2(products: Products, tmp_path: Path) -> None:
+    (tmp_path / "torn.jpg").write_bytes(b"\xff\xd8\xff\xe0 no picture")
+    for words in (
+        ("predict", tmp_path / "absent.jpg", "--model", products.model, "--focal-px", 1400),
+        ("predict", tmp_path / "torn.jpg", "--model", products.model, "--focal-px", 1400),
+        ("eval", tmp_path, "--model", products.model),
+        ("export", tmp_path, "--out", tmp_path / "model"),
+        ("train", tmp_path, "--out", tmp_path / "run", "--spacecraft", CRAFT, "--minutes", 1),
+        ("render", products.frames, "--recipe", RECIPE, "--seed", 5, "--size", 256),
+    ):
+        said = gknet(*words, code=2)
+        assert len(said.strip().splitlines()) == 1, said
+        assert "Traceback" not in said

@@ -1,0 +1,189 @@
+"""The pose solver: exact on the truth, robust, honest about its covariance, and able to say no."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from gknet.errors import GknetError
+from gknet.frame import Estimate, Keypoints
+from gknet.geometry import Camera, Pose
+from gknet.metrics import nees, pose_error_vector
+from gknet.pnp import PnpResult, PnpSettings, solve_pnp
+from tests.strategies import quaternions
+
+POINTS = np.random.default_rng(0).uniform(-1, 1, (16, 3)) * (3, 1, 1)
+CAMERA = Camera.from_focal(1400, 1024, 1024)
+DISTORTED = Camera(
+    np.array([[1494.3, 0, 480], [0, 1494.2, 300], [0, 0, 1]]), 960, 600, np.array([-0.224, 0.514, -7e-4, -2e-4, -0.131])
+)
+POSE = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0.8, -0.5, 15.0])
+
+
+def seen(pose: Pose, camera: Camera = CAMERA, sigma_px: float = 0.5, points: np.ndarray = POINTS) -> Keypoints:
+    pixels = camera.project(pose.transform(points))
+    count = len(points)
+    return Keypoints(pixels, np.full(count, 0.9), np.tile(sigma_px**2 * np.eye(2), (count, 1, 1)))
+
+
+def noisy(keypoints: Keypoints, generator: np.random.Generator) -> Keypoints:
+    roots = np.linalg.cholesky(keypoints.covariance_px2)
+    noise = np.einsum("nij,nj->ni", roots, generator.normal(size=keypoints.pixels.shape))
+    return Keypoints(keypoints.pixels + noise, keypoints.score, keypoints.covariance_px2)
+
+
+def solved(keypoints: Keypoints, camera: Camera = CAMERA, points: np.ndarray = POINTS) -> PnpResult:
+    result = solve_pnp(keypoints, camera, points)
+    assert isinstance(result, PnpResult), result
+    return result
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@given(quaternion=quaternions())
+def test_truth_is_recovered_exactly(camera: Camera, quaternion: np.ndarray) -> None:
+    """Half turns included."""
+    pose = Pose.from_quaternion(quaternion, [0.3, -0.2, 12.0])
+    result = solved(seen(pose, camera), camera)
+    assert np.abs(pose_error_vector(pose, result.cam_from_body)).max() < 1e-5
+    assert result.reprojection_rms_px < 1e-3
+    assert result.inliers.all()
+
+
+@pytest.mark.parametrize("outliers", [5, 8])
+def test_outliers_are_found(outliers: int) -> None:
+    generator = np.random.default_rng(outliers)
+    for _ in range(30):
+        pose = Pose.from_quaternion(generator.normal(size=4), [0.5, 0.3, generator.uniform(8, 25)])
+        clean = noisy(seen(pose), generator)
+        wrong = generator.permutation(16)[:outliers]
+        pixels = clean.pixels.copy()
+        angle = generator.uniform(0, 2 * np.pi, outliers)
+        pixels[wrong] += generator.uniform(30, 200, outliers)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+        result = solved(Keypoints(pixels, clean.score, clean.covariance_px2))
+        assert not result.inliers[wrong].any()
+        assert result.cam_from_body.angle_to(pose) < 0.03
+        assert np.linalg.norm(result.cam_from_body.translation_m - pose.translation_m) < 0.01 * pose.translation_m[2]
+
+
+def test_covariance_matches_the_scatter() -> None:
+    """Monte-Carlo at one pose: the scatter's diagonal and the NEES agree with the stated covariance."""
+    generator = np.random.default_rng(1)
+    truth = seen(POSE, sigma_px=1.0)
+    mixed = Keypoints(truth.pixels, truth.score, truth.covariance_px2 * generator.uniform(0.3, 3, 16)[:, None, None])
+    scatter, squared, stated = [], [], []
+    for _ in range(400):
+        keypoints = noisy(mixed, generator)
+        result = solved(keypoints)
+        scatter.append(pose_error_vector(POSE, result.cam_from_body))
+        stated.append(np.diag(result.covariance))
+        estimate = Estimate(keypoints, result.cam_from_body, result.covariance, result.inliers, 0.0)
+        squared.append(nees(POSE, estimate))
+    ratio = np.array(scatter).var(axis=0) / np.mean(stated, axis=0)
+    assert (np.abs(ratio - 1) < 0.35).all(), ratio
+    assert 5.2 < np.mean(squared) < 7.2
+
+
+def test_a_sure_keypoint_counts_more() -> None:
+    """The one keypoint that is off moves the pose less when it says that it is unsure."""
+    keypoints = seen(POSE)
+    pixels = keypoints.pixels.copy()
+    pixels[3] += (4, 0)
+    unsure = keypoints.covariance_px2.copy()
+    unsure[3] *= 100
+    off = [
+        np.linalg.norm(pose_error_vector(POSE, solved(Keypoints(pixels, keypoints.score, c)).cam_from_body))
+        for c in (keypoints.covariance_px2, unsure)
+    ]
+    assert off[1] < 0.3 * off[0]
+
+
+def test_same_input_same_bits() -> None:
+    keypoints = noisy(seen(POSE), np.random.default_rng(2))
+    first, second = solved(keypoints), solved(keypoints)
+    assert np.array_equal(first.cam_from_body.rotation, second.cam_from_body.rotation)
+    assert np.array_equal(first.covariance, second.covariance)
+
+
+def test_low_scores_and_bad_points_are_not_used() -> None:
+    keypoints = seen(POSE)
+    score, pixels = keypoints.score.copy(), keypoints.pixels.copy()
+    score[0], pixels[0] = 0.0, (512, 512)
+    pixels[1] = np.nan
+    result = solved(Keypoints(pixels, score, keypoints.covariance_px2))
+    assert not result.inliers[:2].any()
+    assert result.inliers[2:].all()
+
+
+@pytest.mark.parametrize("left", [0, 1, 3])
+def test_fewer_than_four_is_a_reason(left: int) -> None:
+    keypoints = seen(POSE)
+    score = np.where(np.arange(16) < left, 0.9, 0.0)
+    reason = solve_pnp(Keypoints(keypoints.pixels, score, keypoints.covariance_px2), CAMERA, POINTS)
+    assert isinstance(reason, str)
+    assert f"only {left}" in reason
+
+
+def test_exactly_four_is_enough() -> None:
+    keypoints = seen(POSE)
+    score = np.where(np.arange(16) < 4, 0.9, 0.0)
+    result = solved(Keypoints(keypoints.pixels, score, keypoints.covariance_px2))
+    assert np.abs(pose_error_vector(POSE, result.cam_from_body)).max() < 1e-4
+
+
+def test_nonsense_is_a_reason() -> None:
+    generator = np.random.default_rng(3)
+    refused = 0
+    for _ in range(20):
+        keypoints = seen(POSE)
+        anywhere = Keypoints(generator.uniform(200, 800, (16, 2)), keypoints.score, keypoints.covariance_px2)
+        refused += isinstance(solve_pnp(anywhere, CAMERA, POINTS), str)
+    assert refused >= 18
+
+
+def test_points_on_a_line_are_a_reason() -> None:
+    line = np.linspace(-2, 2, 8)[:, None] * np.array([[1.0, 0.2, 0.1]])
+    assert isinstance(solve_pnp(seen(POSE, points=line), CAMERA, line), str)
+
+
+def test_all_keypoints_in_one_place_is_a_reason() -> None:
+    keypoints = seen(POSE)
+    same = Keypoints(np.full((16, 2), 500.0), keypoints.score, keypoints.covariance_px2)
+    result = solve_pnp(same, CAMERA, POINTS)
+    assert isinstance(result, str) or result.cam_from_body.translation_m[2] > 100
+
+
+def test_thresholds_follow_the_size_of_an_input_pixel() -> None:
+    """Four times the image, four times the errors: refused in pixels of the image, accepted in the crop's."""
+    generator = np.random.default_rng(4)
+    keypoints = noisy(seen(POSE, sigma_px=12.0), generator)
+    strict = PnpSettings(threshold_px=(5.0,), min_inlier_fraction=0.8)
+    assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 1.0, strict), str)
+    assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 8.0, strict), PnpResult)
+
+
+def test_wrong_count_is_an_error() -> None:
+    with pytest.raises(GknetError, match="16 keypoints"):
+        solve_pnp(seen(POSE, points=POINTS[:10]), CAMERA, POINTS)
+    with pytest.raises(GknetError, match="thresholds"):
+        PnpSettings(threshold_px=())
+
+
+def test_strong_distortion_is_taken_out_before_the_consensus() -> None:
+    wide = Camera(np.array([[500.0, 0, 480], [0, 500.0, 300], [0, 0, 1]]), 960, 600, np.array([-0.28, 0.06, 0, 0, 0]))
+    pose = Pose.from_quaternion([0.9, 0.1, 0.2, 0.1], [0.3, -0.2, 4.0])
+    result = solve_pnp(seen(pose, wide), wide, POINTS, settings=PnpSettings(threshold_px=(0.5,), min_inlier_fraction=1))
+    assert isinstance(result, PnpResult), result
+    assert np.abs(pose_error_vector(pose, result.cam_from_body)).max() < 1e-5
+
+
+def test_a_keypoint_off_by_many_of_its_sigmas_loses_its_pull() -> None:
+    keypoints = seen(POSE)
+    pixels = keypoints.pixels.copy()
+    pixels[3] += (4, 0)
+    off = []
+    for sigma in (0.1, 4.0):
+        covariance = np.tile(sigma**2 * np.eye(2), (16, 1, 1))
+        result = solved(Keypoints(pixels, keypoints.score, covariance))
+        off.append(np.linalg.norm(pose_error_vector(POSE, result.cam_from_body)))
+    assert off[0] < 0.1 * off[1]
