@@ -73,15 +73,30 @@ def read_camera(path: str | Path) -> Camera | MatrixOnly:
 
 
 def _named(source: object, matrix: object, width: object, height: object, distortion: object) -> Camera:
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise GknetError(f"{source}: {name}: expected a whole number of pixels, got {value!r}")
+    """A camera of values as they stood in `source`, which its errors name."""
+    columns, rows = _whole(source, "width", width), _whole(source, "height", height)
+    bent = np.zeros(5) if distortion is None else _numbers(source, "camera distortion", distortion, (5,))
+    straight = _numbers(source, "camera matrix", matrix, (3, 3))
     try:
-        if distortion is None:
-            return Camera(matrix, width, height)  # type: ignore[arg-type]
-        return Camera(matrix, width, height, distortion)  # type: ignore[arg-type]
+        return Camera(straight, columns, rows, bent)
     except GknetError as error:
         raise GknetError(f"{source}: {error}") from error
+
+
+def _whole(source: object, name: str, value: object) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise GknetError(f"{source}: {name}: expected a whole number of pixels, got {value!r}")
+    return value
+
+
+def _numbers(source: object, name: str, values: object, shape: tuple[int, ...]) -> ndarray:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GknetError(f"{source}: {name}: expected numbers of shape {shape}, got {values!r}") from error
+    if array.shape != shape:
+        raise GknetError(f"{source}: {name}: expected shape {shape}, got {array.shape}")
+    return array
 
 
 def _from_json(path: Path) -> Camera:

@@ -28,6 +28,7 @@ def train(
     init: Annotated[Path | None, typer.Option(help=".safetensors to start from, of any spacecraft.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where the run in OUT stopped.")] = False,
     cache: Annotated[Path | None, typer.Option(help="Folder of the decoded crops [DATA/cache].")] = None,
+    val: Annotated[Path | None, typer.Option(help="Dataset whose val split is looked at [DATA].")] = None,
     val_frames: Annotated[int | None, typer.Option(help="Frames of the val split to look at.")] = None,
     validations: Annotated[int | None, typer.Option(help="How often to look at them.")] = None,
 ) -> None:
@@ -53,7 +54,7 @@ def train(
     settings = TrainSettings(network=network, graph=graph, minutes=minutes, epochs=epochs, **given)  # type: ignore[arg-type]
     if batch is not None:
         settings = replace(settings, stages=tuple(replace(stage, batch=batch) for stage in settings.input_stages))
-    state = run(data, spacecraft, out, settings, resume, cache)
+    state = run(data, spacecraft, out, settings, resume, cache, val)
     best = ", ".join(f"{name} {value:.4g}" for name, value in (state.best or {}).items())
     typer.echo(f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min; best: {best or 'none'}")
 

@@ -1,4 +1,7 @@
-"""The three spacecraft of the dataset: their keypoints are at hand always, their meshes are built with [render]."""
+"""The three spacecraft of the dataset: their keypoints are at hand always, their meshes are built with [render].
+
+The .toml files here are copies of what `build` writes: `gknet fleet OUT && cp OUT/*.toml src/gknet/fleet/`.
+"""
 
 from __future__ import annotations
 

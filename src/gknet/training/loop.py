@@ -46,11 +46,13 @@ def train(
     settings: TrainSettings,
     resume: bool = False,
     cache_folder: Path | None = None,
+    val: Path | None = None,
     quiet: bool = False,
     on_step: Callable[[int], None] = lambda samples: None,
 ) -> State:
-    """Train on the train split of the SKD folder `data`, validate on its val split.
+    """Train on the train split of the SKD folder `data`, validate on the val split of the folder `val`.
 
+    val           `data` when None; crops to train on and whole frames to validate on are folders of their own
     out           gets run.json, metrics.csv, tensorboard/, checkpoint.pt and best.safetensors (averaged weights)
     resume        go on from out/checkpoint.pt; a larger budget prolongs the run
     cache_folder  of the decoded crops; data/cache when None
@@ -61,7 +63,8 @@ def train(
         raise GknetError(f"{out}: it holds a training already; --resume goes on with it, or choose another folder")
     fabric = make_fabric(settings)
     torch.manual_seed(settings.seed)
-    training_data, val_data = SkdDataset(data, "train", spacecraft_name), SkdDataset(data, "val", spacecraft_name)
+    training_data = SkdDataset(data, "train", spacecraft_name)
+    val_data = SkdDataset(val or data, "val", spacecraft_name)
     spacecraft = training_data.spacecraft
     rows = validation_rows(len(val_data), settings.val_frames)
     out.mkdir(parents=True, exist_ok=True)

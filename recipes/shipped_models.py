@@ -1,0 +1,115 @@
+"""The models that ship: for each spacecraft a locator and a gknet-s, trained on the `skd` recipe, and their figures.
+
+    pip install '.[render,train]'
+    python recipes/shipped_models.py --work runs/shipped --out src/gknet/models --results results/shipped_models
+
+Hardware   2 CPU cores with bfloat16 (AVX-512), no GPU
+Time       about 40 minutes of rendering and 25 minutes of training a spacecraft
+Expected   the table of README.md, printed from results/shipped_models/*/metrics.json
+
+Every stage keeps what is done: run the command again after an interruption. Only train sequences are trained on, val
+sequences choose the weights and scale the covariances, and test sequences are looked at once, by `evaluate`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from gknet.cli.evaluate import evaluate
+from gknet.fleet import NAMES
+from gknet.render.generate import generate
+from gknet.training.checkpoint import BEST, CHECKPOINT
+from gknet.training.export import export_run
+from gknet.training.loop import train
+from gknet.training.schedule import Stage
+from gknet.training.settings import TrainSettings
+
+SEED = 0
+KEYPOINT_STAGES = (Stage(0.55, 128, 32), Stage(0.25, 192, 32), Stage(0.20, 256, 32))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is rendered and trained. `every` = 2 takes each second frame of a sequence of 300."""
+
+    crops_every: int
+    pictures_every: int
+    val_every: int
+    test_every: int
+    keypoint_epochs: float
+    locator_epochs: float
+
+
+SCALES = {
+    "cpu": Scale(2, 6, 30, 15, keypoint_epochs=14, locator_epochs=14),
+    "full": Scale(1, 1, 10, 1, keypoint_epochs=80, locator_epochs=20),
+}
+
+
+def render(work: Path, scale: Scale) -> None:
+    """Crops to train the keypoints on, small whole pictures for the locator, whole frames to judge by."""
+    for name in NAMES:
+        generate("skd", work / "crops", SEED, name, "train", window="target", every=scale.crops_every)
+        generate("skd", work / "pictures", SEED, name, "train", every=scale.pictures_every, size=256)
+        generate("skd", work / "frames", SEED, name, "val", every=scale.val_every)
+        generate("skd", work / "frames", SEED, name, "test", every=scale.test_every)
+        generate("skd-hard", work / "hard", SEED, name, "test", every=scale.test_every)
+
+
+def train_all(work: Path, scale: Scale) -> None:
+    """The first spacecraft from scratch; the others start from its weights, where the shapes fit."""
+    first: Path | None = None
+    for name in NAMES:
+        runs = {
+            "keypoints": (work / "crops", keypoint_settings(scale, first)),
+            "locator": (work / "pictures", TrainSettings("locator", epochs=scale.locator_epochs, validations=4)),
+        }
+        for kind, (data, settings) in runs.items():
+            out = work / "runs" / f"{name}_{kind}"
+            resume = (out / CHECKPOINT).exists()
+            train(data, name, out, settings, resume, work / "cache", val=work / "frames")
+        first = first or work / "runs" / f"{name}_keypoints" / BEST
+
+
+def keypoint_settings(scale: Scale, init: Path | None) -> TrainSettings:
+    return TrainSettings(
+        "gknet-s", epochs=scale.keypoint_epochs, stages=KEYPOINT_STAGES, validations=6, seed=SEED, init=init
+    )
+
+
+def ship(work: Path, out: Path) -> None:
+    for name in NAMES:
+        for kind in ("keypoints", "locator"):
+            export_run(work / "runs" / f"{name}_{kind}", out / name)
+
+
+def judge(work: Path, models: Path, results: Path) -> None:
+    """The test sequences of both recipes, oracle crop and detected crop; only the figures are kept in the repository."""
+    for name in NAMES:
+        for data in ("frames", "hard"):
+            pages = work / "evaluation" / f"{name}_{data}"
+            evaluate(work / data, model=models / name, split="test", out=pages)
+            kept = results / f"{name}_{'skd' if data == 'frames' else 'skd-hard'}.json"
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(pages / "metrics.json", kept)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="folder of data, caches and runs (30 GB at full scale)")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the exported models")
+    parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
+    parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")
+    arguments = parser.parse_args()
+    scale = SCALES[arguments.scale]
+    render(arguments.work, scale)
+    train_all(arguments.work, scale)
+    ship(arguments.work, arguments.out)
+    judge(arguments.work, arguments.out, arguments.results)
+
+
+if __name__ == "__main__":
+    main()
