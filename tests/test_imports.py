@@ -14,7 +14,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 
 LAYERS = (
     {"errors"},
-    {"atomic", "geometry"},
+    {"atomic", "geometry", "progress"},
     {"frame", "image", "video"},
     {"crop", "spacecraft"},
     {"decode", "onnx_network", "pnp"},

@@ -19,7 +19,7 @@ from gknet.spacecraft import Spacecraft, spacecraft_toml
 SIZE, FOCAL_PX = 256, 350.0
 CAMERA = Camera.from_focal(FOCAL_PX, SIZE, SIZE)
 _CELL = 16
-_STEP = 6
+_STEP = 12
 
 
 def toy_spacecraft() -> Spacecraft:
@@ -58,7 +58,7 @@ def picture_number(image: ndarray) -> int:
 
 
 def write_toy_dataset(root: Path, sequences: int = 2, frames: int = 5) -> Path:
-    """Test sequences of the toy in the SKD layout, numbered through."""
+    """Test sequences of the toy in the SKD layout, numbered through; 20 frames at the most."""
     spacecraft = toy_spacecraft()
     (root / "spacecraft").mkdir(parents=True)
     write_text(root / "spacecraft" / "toycraft.toml", spacecraft_toml(spacecraft))

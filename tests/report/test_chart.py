@@ -27,7 +27,7 @@ def test_curve_is_drawn_to_scale() -> None:
         Axis("y", low=0, high=1),
         [Series("a", np.array([0, 5.0, 10]), np.array([0, 0.5, 1]))],
     )
-    assert {"A < B", "x in m", "y", "a", "0", "10", "0.5"} <= set(texts(svg))
+    assert {"A < B", "x in m", "y", "a", "0", "10", "0.4"} <= set(texts(svg))
     ((first, middle, last),) = polylines(svg)
     assert np.allclose(middle, (first + last) / 2, atol=0.1)
     assert last[0] > first[0]

@@ -40,14 +40,16 @@ class Finding:
 def doctor() -> None:
     """Check this installation: libraries, models, extras, processor, disk."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     colours = {State.good: "green", State.note: "yellow", State.bad: "bold red"}
     table = Table(show_header=False, box=None, pad_edge=False)
     findings = list(examine())
     for finding in findings:
-        remedy = f"\n[dim]{finding.remedy}[/dim]" if finding.remedy else ""
-        table.add_row(f"[{colours[finding.state]}]{finding.state}[/]", finding.what, f"{finding.words}{remedy}")
+        remedy = f"\n[dim]{escape(finding.remedy)}[/dim]" if finding.remedy else ""
+        words = escape(finding.words) + remedy
+        table.add_row(f"[{colours[finding.state]}]{finding.state}[/]", finding.what, words)
     Console().print(table)
     bad = [finding.what for finding in findings if finding.state is State.bad]
     if bad:
@@ -160,14 +162,14 @@ def _extra(extra: str) -> Finding:
     found, missing = _versions(_EXTRAS[extra])
     if missing:
         words = "not installed" if not found else f"missing: {', '.join(missing)}"
-        return Finding(f"extra {extra}", State.note, words, f"pip install 'gknet\\[{extra}]'")
+        return Finding(f"extra {extra}", State.note, words, f"pip install 'gknet[{extra}]'")
     return Finding(f"extra {extra}", State.good, ", ".join(f"{p} {v}" for p, v in found.items()))
 
 
 def _renderer() -> Finding:
     """Which of Mitsuba's variants a render would take."""
     if _versions(("mitsuba",))[1]:
-        return Finding("renderer", State.note, "not installed", "pip install 'gknet\\[render]'")
+        return Finding("renderer", State.note, "not installed", "pip install 'gknet[render]'")
     try:
         from gknet.render.scene import choose_variant
 

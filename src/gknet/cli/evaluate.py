@@ -46,7 +46,7 @@ def evaluate(
 
 def evaluate_section(dataset: SkdDataset, estimator: Estimator, words: str, pictures: int) -> Section:
     """Evaluate with a progress bar, with the pictures for the page. Without a locator only the oracle's crop is run."""
-    from gknet.cli.progress import progress
+    from gknet.progress import progress
     from gknet.evaluation import PROTOCOL_WORDS, evaluate
     from gknet.report.gallery import galleries
     from gknet.report.page import Section

@@ -6,7 +6,7 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -20,8 +20,8 @@ from gknet.cli.render import render
 from gknet.cli.train import export, train
 from gknet.errors import GknetError, MissingExtraError
 
-_USAGE_ERROR = typer.BadParameter.__mro__[1]
-"""What typer raises for a wrong command line: the parent of its BadParameter."""
+_USAGE_ERROR = cast(type[typer.BadParameter], typer.BadParameter.__mro__[1])
+"""What typer raises for a wrong command line: the parent of its BadParameter, which it does not export."""
 
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
 
@@ -73,16 +73,16 @@ def run(arguments: Sequence[str]) -> int:
         code = app(list(arguments) or ["--help"], prog_name="gknet", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
-    except _USAGE_ERROR as error:
-        return _end(error.format_message(), BAD_INPUT)
     except Exception as error:
-        if debug:
+        if debug and not isinstance(error, _USAGE_ERROR):
             raise
         return _end_badly(error)
     return _end("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
 
 
 def _end_badly(error: Exception) -> int:
+    if isinstance(error, _USAGE_ERROR):
+        return _end(error.format_message(), BAD_INPUT)
     if isinstance(error, GknetError):
         return _end(str(error), BAD_INPUT)
     if isinstance(error, ModuleNotFoundError):

@@ -100,7 +100,7 @@ def predict_all(
     source: Source, estimator: Estimator, files: PredictionFiles, box: Box | None = None, oracle: bool = False
 ) -> None:
     """Every picture of the source into the files; one that cannot be read is recorded and passed over."""
-    from gknet.cli.progress import progress
+    from gknet.progress import progress
     from gknet.source import Unreadable
 
     with progress() as bar:

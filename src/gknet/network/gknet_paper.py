@@ -26,7 +26,7 @@ class GKNetPaperConfig:
 
     base: int = 64
     node_width: int = 512
-    node_hidden: int = 1024
+    node_hidden: int = 2048
     node_layers: int = 3
     heads: int = 8
     graph: str = "skeleton"

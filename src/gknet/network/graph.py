@@ -57,20 +57,20 @@ class GraphConvolution(nn.Module):
 
 
 class GraphLayer(nn.Module):
-    """Nodes look at the picture, at each other, and along the edges; each with a residual and a LayerNorm."""
+    """Nodes look at the picture, then talk along the edges; each with a residual and a LayerNorm.
+
+    The edges are the only way from node to node, so that an ablation of the edges is one of the graph.
+    """
 
     def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int) -> None:
         super().__init__()
         self.look = Attention(width, heads)
         self.after_look = nn.LayerNorm(width)
-        self.share = Attention(width, heads)
-        self.after_share = nn.LayerNorm(width)
         self.graph = GraphConvolution(adjacency, width, hidden)
         self.after_graph = nn.LayerNorm(width)
 
     def forward(self, nodes: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
         nodes = self.after_look(nodes + self.look(nodes, memory))
-        nodes = self.after_share(nodes + self.share(nodes, nodes))
         return self.after_graph(nodes + self.graph(nodes))
 
 

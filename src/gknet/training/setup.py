@@ -86,7 +86,7 @@ def update_average(average: nn.Module, network: nn.Module, keep: float) -> None:
 
 def open_cache(data: SkdDataset, settings: TrainSettings, folder: Path, say: Callable[[str], None]) -> Cache:
     """The decoded crops of `data`, built under `folder` if they are not there."""
-    from gknet.cli.progress import progress
+    from gknet.progress import progress
 
     files = [data.extras(row).image_path.stat() for row in validation_rows(len(data), STAMPED)]
     stamp = " ".join(f"{file.st_size}:{file.st_mtime_ns}" for file in files)

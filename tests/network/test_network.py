@@ -1,0 +1,150 @@
+"""Laws of the networks: shapes at every size and N, identity of channels and nodes, the constant graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from gknet.errors import GknetError  # noqa: E402
+from gknet.network.backbone import position_code  # noqa: E402
+from gknet.network.build import build, configured, gknet_paper, gknet_s, locator  # noqa: E402
+from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
+from gknet.network.graph import Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
+
+
+def chain(count: int) -> np.ndarray:
+    matrix = np.eye(count, dtype=bool)
+    for i in range(count - 1):
+        matrix[i, i + 1] = matrix[i + 1, i] = True
+    return matrix
+
+
+def tiny(count: int, graph: str = "skeleton") -> GKNet:
+    torch.manual_seed(0)
+    return GKNet(GKNetConfig(width=4, pyramid_width=8, node_width=8, node_layers=2, heads=2, graph=graph), chain(count))
+
+
+def parameters(network: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+@pytest.mark.parametrize("count", [4, 13, 24])
+@pytest.mark.parametrize("size", [128, 192, 256])
+def test_any_number_of_keypoints_and_any_input_size(count: int, size: int) -> None:
+    heatmaps = tiny(count)(torch.rand(2, 3, size, size))
+    assert heatmaps.shape == (2, count, size // 4, size // 4)
+
+
+@pytest.mark.parametrize("graph", ["skeleton", "identity", "none"])
+def test_the_forward_pass_is_the_fused_branches(graph: str) -> None:
+    network = tiny(5, graph).eval()
+    image = torch.rand(1, 3, 64, 64)
+    branches = network.branches(image)
+    assert torch.equal(network(image), branches.heatmaps)
+    assert (branches.nodes is None) == (graph == "none")
+
+
+def test_without_edges_the_size_is_the_same() -> None:
+    assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton"))
+
+
+def test_named_sizes() -> None:
+    assert 2e6 < parameters(gknet_s(chain(16))) < 3.5e6
+    assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
+    assert 0.5e6 < parameters(locator()) < 0.8e6
+
+
+def test_adjacency_is_normalised_as_in_equation_3() -> None:
+    matrix = chain(4)
+    degree = matrix.sum(axis=1)
+    expected = matrix / np.sqrt(degree[:, None] * degree[None, :])
+    np.testing.assert_allclose(normalised_adjacency(matrix).numpy(), expected, atol=1e-7)
+    np.testing.assert_array_equal(normalised_adjacency(matrix, "identity").numpy(), np.eye(4))
+
+
+@pytest.mark.parametrize("bad", [np.ones((3, 4)), np.zeros((3, 3)), 2 * np.eye(3), np.array([[1, 1], [0, 1]])])
+def test_a_matrix_that_is_no_adjacency_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(GknetError, match="adjacency"):
+        normalised_adjacency(bad)
+
+
+def test_the_graph_is_a_constant_of_the_spacecraft() -> None:
+    network = tiny(6)
+    assert network.decoder is not None
+    assert not [name for name in network.state_dict() if "adjacency" in name]
+    assert not [name for name, _ in network.named_parameters() if "adjacency" in name]
+    before = network.decoder.layers[0].graph.adjacency.clone()
+    network(torch.rand(2, 3, 64, 64)).sum().backward()
+    assert torch.equal(before, network.decoder.layers[0].graph.adjacency)
+
+
+def test_nodes_mix_along_edges_only() -> None:
+    torch.manual_seed(1)
+    layer = GraphConvolution(normalised_adjacency(chain(5)), 8, 8)
+    nodes = torch.randn(1, 5, 8)
+    moved = nodes.clone()
+    moved[0, 0] += 1
+    changed = (layer(nodes) - layer(moved)).abs().amax(dim=2)[0] > 1e-7
+    assert changed.tolist() == [True, True, False, False, False]
+
+
+def test_renumbering_the_keypoints_renumbers_nodes_and_nothing_else() -> None:
+    order = torch.tensor([3, 0, 4, 1, 2])
+    torch.manual_seed(2)
+    layer = GraphConvolution(normalised_adjacency(chain(5)), 8, 8)
+    matrix = chain(5)[np.ix_(order.numpy(), order.numpy())]
+    other = GraphConvolution(normalised_adjacency(matrix), 8, 8)
+    other.load_state_dict(layer.state_dict())
+    nodes = torch.randn(2, 5, 8)
+    torch.testing.assert_close(layer(nodes)[:, order], other(nodes[:, order]))
+
+
+def test_at_the_start_both_branches_reach_the_output_channel_by_channel() -> None:
+    fusion = Fusion(3)
+    pixels, nodes = torch.randn(1, 3, 4, 4), torch.randn(1, 3, 4, 4)
+    torch.testing.assert_close(fusion(pixels, nodes), pixels + nodes)
+
+
+def test_at_the_start_the_graph_does_not_drown_the_other_branch() -> None:
+    branches = gknet_s(chain(16)).branches(torch.rand(2, 3, 128, 128))
+    assert branches.nodes is not None
+    assert branches.heatmaps.abs().max() < 1
+    assert branches.nodes.abs().mean() < 0.1
+
+
+def test_gradients_reach_every_parameter() -> None:
+    network = tiny(5)
+    (network(torch.rand(2, 3, 64, 64)) - 1).square().sum().backward()
+    assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+
+
+def test_the_code_of_a_place_is_the_same_at_every_resolution() -> None:
+    fine, coarse = position_code(30, 30, torch.zeros(1)), position_code(10, 10, torch.zeros(1))
+    torch.testing.assert_close(fine[:, 1::3, 1::3], coarse, atol=1e-5, rtol=0)
+
+
+def test_the_locator_speaks_of_probabilities_and_lengths() -> None:
+    output = locator()(torch.rand(2, 3, 256, 256))
+    assert output.shape == (2, 5, 64, 64)
+    assert (output >= 0).all()
+    assert (output[:, 0] <= 1).all()
+
+
+def test_an_image_alone_does_not_depend_on_its_batch() -> None:
+    network = tiny(5).eval()
+    images = torch.rand(3, 3, 64, 64)
+    torch.testing.assert_close(network(images)[1:2], network(images[1:2]), atol=1e-5, rtol=1e-4)
+
+
+def test_bad_choices_are_named() -> None:
+    with pytest.raises(GknetError, match="unknown key 'widht'"):
+        configured(GKNetConfig, {"widht": 3})
+    assert configured(GKNetConfig, {"width": 16}).width == 16
+    with pytest.raises(GknetError, match="graph"):
+        GKNetConfig(graph="full")
+    with pytest.raises(GknetError, match="network"):
+        build("hourglass", chain(5))
+    with pytest.raises(GknetError, match="multiples of 32"):
+        tiny(5)(torch.rand(1, 3, 100, 100))

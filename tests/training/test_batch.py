@@ -1,0 +1,176 @@
+"""The cache keeps what the frames say; identity k stays row k; item i never depends on the order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from gknet.crop import Crop  # noqa: E402
+from gknet.dataset.skd import SkdDataset  # noqa: E402
+from gknet.errors import GknetError  # noqa: E402
+from gknet.frame import Frame  # noqa: E402
+from gknet.geometry import Camera, Pose  # noqa: E402
+from gknet.training.batch import Loader, draw_box, draw_keypoints  # noqa: E402
+from gknet.training.cache import build_cache, cached_row, craft_window  # noqa: E402
+from gknet.training.schedule import Stage  # noqa: E402
+from tests.training.toy import POINTS, drawn, toy_spacecraft, write_toy  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("toy")
+    write_toy(root, 12, 3, 96)
+    return root
+
+
+def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 512) -> Frame:
+    camera = Camera.from_focal(1.2 * size, size, size)
+    pose = Pose.from_rotation_vector([0.5, 0.2, -0.7], place)
+    return Frame("one", drawn(camera, pose), camera, pose)
+
+
+def test_a_cached_row_is_the_frame_through_a_crop() -> None:
+    frame = a_frame()
+    row = cached_row(frame, POINTS, "craft", 160)
+    box = frame.true_box(POINTS)
+    assert row is not None
+    assert box is not None
+    crop = craft_window(frame, box, 160)
+    assert crop == Crop.around(box, 160, 1.6)
+    np.testing.assert_allclose(crop.to_image(row.points_px), frame.keypoints_px(POINTS))
+    assert row.in_view.all()
+    np.testing.assert_allclose(
+        row.box_px[2:] - row.box_px[:2], (np.array([box.x1 - box.x0, box.y1 - box.y0])) * crop.scale
+    )
+
+
+def test_a_window_around_the_craft_is_taken_whole() -> None:
+    frame = a_frame((0, 0, 8), 200)
+    box = frame.true_box(POINTS)
+    assert box is not None
+    assert craft_window(frame, box, 160) == Crop(0, 0, 200, 160)
+
+
+def test_truncation_masks_and_never_renumbers() -> None:
+    frame = a_frame((3.0, 0.5, 12.0))
+    row = cached_row(frame, POINTS, "craft", 160)
+    assert row is not None
+    truth = frame.keypoints_px(POINTS)
+    inside = frame.camera.contains(truth)
+    assert 4 <= inside.sum() < len(POINTS)
+    np.testing.assert_array_equal(row.in_view, inside)
+    assert row.points_px.shape == truth.shape
+
+
+def test_frames_without_the_craft_are_no_rows() -> None:
+    assert cached_row(a_frame((40.0, 0.0, 12.0)), POINTS, "craft", 64) is None
+    behind = replace(a_frame(), cam_from_body=Pose(np.eye(3), np.array([0, 0, -20.0])))
+    assert cached_row(behind, POINTS, "craft", 64) is None
+
+
+class Frames:
+    """A dataset in memory; frame `bad` cannot be read."""
+
+    def __init__(self, frames: list[Frame], bad: int = -1) -> None:
+        self.frames, self.bad, self.reads = frames, bad, 0
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def frame(self, i: int, image: bool = True) -> Frame:
+        if image:
+            self.reads += 1
+            if i == self.bad:
+                raise GknetError("frame 1: truncated")
+        return self.frames[i] if image else replace(self.frames[i], image=None)
+
+
+def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: Path) -> None:
+    frames = Frames([a_frame((0.2 * k, 0, 12), 128) for k in range(5)], bad=1)
+    said: list[str] = []
+    cache = build_cache(frames, POINTS, tmp_path, 64, report=said.append)
+    assert len(cache) == 4
+    assert said == ["left out: frame 1: truncated"]
+    again = build_cache(frames, POINTS, tmp_path, 64)
+    assert frames.reads == 5
+    np.testing.assert_array_equal(again.images, cache.images)
+    frames.frames[0] = a_frame((0.0, 0.1, 12), 128)
+    assert not np.array_equal(build_cache(frames, POINTS, tmp_path, 64).points_px[0], cache.points_px[0])
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
+    for frames in ([], [a_frame((40.0, 0.0, 12.0), 64)]):
+        with pytest.raises(GknetError, match="cache"):
+            build_cache(Frames(frames), POINTS, tmp_path, 64)
+    assert not list(tmp_path.glob("*"))
+
+
+def loader(folder: Path, draw=draw_keypoints, **options: int) -> Loader:
+    data = SkdDataset(folder, "train", "satellite_01")
+    window = "picture" if draw is draw_box else "craft"
+    return Loader(build_cache(data, data.spacecraft.points_m, folder / "cache", 96, window), draw, 7, **options)
+
+
+def test_an_epoch_shows_every_row_once(folder: Path) -> None:
+    items = loader(folder)
+    for epoch in range(3):
+        assert sorted(items._order(epoch)) == list(range(12))
+    assert not np.array_equal(items._order(0), items._order(1))
+
+
+def test_a_batch_depends_on_its_position_only(folder: Path) -> None:
+    items = loader(folder)
+    stage = Stage(1, 64, 5)
+    stream = items.batches(0, lambda place: stage)
+    streamed = [next(stream) for _ in range(4)]
+    stream.close()
+    resumed = items.batches(10, lambda place: stage)
+    third = next(resumed)
+    resumed.close()
+    assert [batch.position for batch in streamed] == [5, 10, 15, 20]
+    assert torch.equal(streamed[2].image, third.image)
+    assert torch.equal(streamed[2].points_px, third.points_px)
+
+
+def test_processes_share_the_samples_of_one(folder: Path) -> None:
+    whole = loader(folder).batch(0, Stage(1, 64, 4))
+    parts = [loader(folder, rank=rank, world=2).batch(0, Stage(1, 64, 2)) for rank in range(2)]
+    assert {part.position for part in parts} == {whole.position}
+    together = torch.stack([part.points_px for part in parts], dim=1).flatten(0, 1)
+    assert torch.equal(together, whole.points_px)
+
+
+def test_an_error_in_the_thread_reaches_the_loop(folder: Path) -> None:
+    def broken(*_: object) -> None:
+        raise GknetError("no such sample")
+
+    stream = loader(folder, broken).batches(0, lambda place: Stage(1, 64, 2))
+    with pytest.raises(GknetError, match="no such sample"):
+        next(stream)
+
+
+def test_the_network_sees_what_the_points_say(folder: Path) -> None:
+    """At the points of a bright mast's end there is light; weights are 1 for what is in view."""
+    batch = loader(folder).batch(0, Stage(1, 128, 8))
+    image = batch.network_input(torch.device("cpu"))
+    assert image.shape == (8, 3, 128, 128)
+    assert image.is_contiguous(memory_format=torch.channels_last)
+    assert 0 <= image.min() < image.max() <= 1
+    assert batch.points_px.shape == (8, len(toy_spacecraft().points_m), 2)
+    seen = batch.weight > 0
+    assert seen.float().mean() > 0.8
+    assert (batch.points_px[seen] >= 0).all()
+    assert (batch.points_px[seen] <= 128).all()
+
+
+def test_boxes_are_corners_in_order_inside_the_input(folder: Path) -> None:
+    batch = loader(folder, draw_box).batch(0, Stage(1, 64, 12))
+    low, high = batch.points_px[:, 0], batch.points_px[:, 1]
+    assert (batch.weight == 1).all()
+    assert ((low >= 0) & (high <= 64) & (high > low)).all()

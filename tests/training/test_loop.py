@@ -1,0 +1,167 @@
+"""Training resumes exactly, keeps the best, warm-starts; export agrees with torch or is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("lightning_fabric")
+
+import gknet.training.export as exporting  # noqa: E402
+from gknet.errors import GknetError  # noqa: E402
+from gknet.onnx_network import OnnxNetwork  # noqa: E402
+from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
+from gknet.training.export import export_run  # noqa: E402
+from gknet.training.loop import train  # noqa: E402
+from gknet.training.schedule import Stage  # noqa: E402
+from gknet.training.settings import TrainSettings, load_run  # noqa: E402
+from tests.training.toy import write_toy  # noqa: E402
+
+SETTINGS = TrainSettings(
+    epochs=3,
+    stages=(Stage(0.5, 32, 4), Stage(0.5, 64, 4)),
+    precision="32-true",
+    device="cpu",
+    cache_size=96,
+    val_frames=2,
+    validations=1,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("toy")
+    write_toy(root, 12, 2, 96)
+    return root
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "straight"
+    train(data, "satellite_01", out, SETTINGS, quiet=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def located(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "locator"
+    train(data, "satellite_01", out, replace(SETTINGS, network="locator", epochs=1), quiet=True)
+    return out
+
+
+def saved(out: Path) -> dict:
+    return torch.load(out / CHECKPOINT, weights_only=True)
+
+
+def test_a_run_leaves_its_files(finished: Path) -> None:
+    run = load_run(finished)
+    assert run.best is not None
+    assert run.best["samples"] == 36
+    with open(finished / "metrics.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[-1]["progress"]) == 1
+    assert "val_rmse_px" in rows[-1]
+    assert list((finished / "tensorboard").iterdir())
+    assert not list(finished.glob(".*.tmp"))
+
+
+def test_an_interrupted_run_resumes_to_the_same_weights(data: Path, finished: Path, tmp_path: Path) -> None:
+    def interrupt(samples: int) -> None:
+        if samples == 16:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(data, "satellite_01", tmp_path / "run", SETTINGS, quiet=True, on_step=interrupt)
+    assert saved(tmp_path / "run")["state"]["samples"] == 16
+    train(data, "satellite_01", tmp_path / "run", SETTINGS, resume=True, quiet=True)
+    straight, resumed = saved(finished), saved(tmp_path / "run")
+    for part in ("network", "average"):
+        for name, tensor in straight[part].items():
+            assert torch.equal(tensor, resumed[part][name]), f"{part}.{name}"
+    assert straight["state"]["best"] == resumed["state"]["best"]
+
+
+def test_a_finished_run_is_prolonged(data: Path, located: Path) -> None:
+    before = saved(located)["state"]["samples"]
+    state = train(
+        data, "satellite_01", located, replace(SETTINGS, network="locator", epochs=2), resume=True, quiet=True
+    )
+    assert (before, state.samples) == (12, 24)
+
+
+def test_a_run_is_not_overwritten_and_not_confused(data: Path, finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(GknetError, match="--resume"):
+        train(data, "satellite_01", finished, SETTINGS, quiet=True)
+    with pytest.raises(GknetError, match="another training"):
+        train(data, "satellite_01", finished, replace(SETTINGS, network="locator"), resume=True, quiet=True)
+    with pytest.raises(GknetError, match="no checkpoint"):
+        train(data, "satellite_01", tmp_path, SETTINGS, resume=True, quiet=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")
+    with pytest.raises(GknetError, match="not a readable checkpoint"):
+        train(data, "satellite_01", tmp_path, SETTINGS, resume=True, quiet=True)
+
+
+def test_a_warm_start_takes_what_fits(finished: Path) -> None:
+    from gknet.network.build import gknet_s
+    from gknet.training.checkpoint import warm_start
+
+    other = gknet_s(np.eye(5, dtype=bool))
+    queries = other.decoder.queries.clone()
+    taken, total = warm_start(other, finished / BEST)
+    assert 0.9 * total < taken < total
+    assert torch.equal(other.encoder.stem.conv.weight, load_weights(finished / BEST)["encoder.stem.conv.weight"])
+    assert torch.equal(other.decoder.queries, queries)
+    with pytest.raises(GknetError, match="cannot read"):
+        warm_start(other, finished / "run.json")
+
+
+def test_exports_agree_with_torch_and_know_what_they_are(finished: Path, located: Path, tmp_path: Path) -> None:
+    for run, kind, channels in ((finished, "keypoints", 17), (located, "locator", 5)):
+        result = export_run(run, tmp_path)
+        assert result.onnx_path == tmp_path / f"{kind}.onnx"
+        assert result.runtime_difference <= 1e-3
+        network = OnnxNetwork(result.onnx_path, threads=1)
+        assert network.metadata.kind == kind
+        assert network.metadata.stride == 4
+        assert network.spacecraft.name == "satellite_01"
+        assert network(np.zeros((2, 3, 256, 256), np.float32)).shape == (2, channels, 64, 64)
+        assert result.onnx_path.stat().st_size < 0.65 * 4 * sum(t.numel() for t in load_weights(run / BEST).values())
+        again = load_weights(result.weights_path)
+        for name, tensor in load_weights(run / BEST).items():
+            torch.testing.assert_close(again[name], tensor, atol=1e-3, rtol=1e-3)
+
+
+def test_an_export_that_differs_is_refused(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    true_run = exporting.run_onnx
+    monkeypatch.setattr(exporting, "run_onnx", lambda model, images: true_run(model, images) + 0.01)
+    with pytest.raises(GknetError, match="tolerance"):
+        export_run(finished, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_no_run(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(GknetError, match="gknet train"):
+        export_run(tmp_path, tmp_path)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(GknetError, match="JSON"):
+        export_run(tmp_path, tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps({"network": "gknet-s"}))
+    with pytest.raises(GknetError, match="expected the keys"):
+        export_run(tmp_path, tmp_path)
+    (tmp_path / "run.json").write_text((finished / "run.json").read_text())
+    with pytest.raises(GknetError, match="cannot read the weights"):
+        export_run(tmp_path, tmp_path)
