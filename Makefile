@@ -12,7 +12,7 @@ demo: .venv/installed
 	.venv/bin/gknet demo
 
 test: lint
-	.venv-test/bin/python -m pytest tests
+	.venv-test/bin/python -m pytest tests --durations=10
 
 lint: .venv-test/installed
 	.venv-test/bin/ruff check .

@@ -4,7 +4,7 @@
     python recipes/shipped_models.py --work runs/shipped --out src/gknet/models --results results/shipped_models
 
 Hardware   2 CPU cores with bfloat16 (AVX-512), no GPU
-Time       about 40 minutes of rendering and 25 minutes of training a spacecraft
+Time       about 25 minutes of rendering, then 17 minutes for the first weights and about 14 a spacecraft
 Expected   the table of README.md, printed from results/shipped_models/*/metrics.json
 
 Every stage keeps what is done: run the command again after an interruption. Only train sequences are trained on, val
@@ -28,24 +28,32 @@ from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
 
 SEED = 0
-KEYPOINT_STAGES = (Stage(0.55, 128, 32), Stage(0.25, 192, 32), Stage(0.20, 256, 32))
+FIRST_STAGES = (Stage(0.55, 128, 16), Stage(0.25, 192, 16), Stage(0.20, 256, 16))
+KEYPOINT_STAGES = (Stage(0.55, 128, 16), Stage(0.45, 192, 16))
+FULL_STAGES = (Stage(0.4, 128, 32), Stage(0.2, 192, 32), Stage(0.4, 256, 32))
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is rendered and trained. `every` = 2 takes each second frame of a sequence of 300."""
+    """How much is rendered and trained. `every` = 2 takes each second frame of a sequence of 300.
+
+    first_minutes     of the run on the first spacecraft whose weights all three start from
+    keypoint_minutes  of each spacecraft's own run
+    """
 
     crops_every: int
     pictures_every: int
     val_every: int
     test_every: int
-    keypoint_epochs: float
-    locator_epochs: float
+    first_minutes: float
+    keypoint_minutes: tuple[float, float, float]
+    locator_minutes: float
+    stages: tuple[Stage, ...]
 
 
 SCALES = {
-    "cpu": Scale(2, 6, 30, 15, keypoint_epochs=14, locator_epochs=14),
-    "full": Scale(1, 1, 10, 1, keypoint_epochs=80, locator_epochs=20),
+    "cpu": Scale(2, 6, 30, 15, 17, (10, 13, 12), 2, KEYPOINT_STAGES),
+    "full": Scale(1, 1, 10, 1, 60, (600, 600, 600), 60, FULL_STAGES),
 }
 
 
@@ -60,24 +68,26 @@ def render(work: Path, scale: Scale) -> None:
 
 
 def train_all(work: Path, scale: Scale) -> None:
-    """The first spacecraft from scratch; the others start from its weights, where the shapes fit."""
-    first: Path | None = None
-    for name in NAMES:
-        runs = {
-            "keypoints": (work / "crops", keypoint_settings(scale, first)),
-            "locator": (work / "pictures", TrainSettings("locator", epochs=scale.locator_epochs, validations=4)),
-        }
-        for kind, (data, settings) in runs.items():
-            out = work / "runs" / f"{name}_{kind}"
-            resume = (out / CHECKPOINT).exists()
-            train(data, name, out, settings, resume, work / "cache", val=work / "frames")
-        first = first or work / "runs" / f"{name}_keypoints" / BEST
+    """Every keypoint network starts from one short run on the first spacecraft, where the shapes fit."""
+    first = work / "runs" / "first"
+    run(work, "crops", NAMES[0], first, keypoint_settings(scale.first_minutes, FIRST_STAGES, None))
+    for name, minutes in zip(NAMES, scale.keypoint_minutes, strict=True):
+        settings = keypoint_settings(minutes, scale.stages, first / BEST)
+        run(work, "crops", name, work / "runs" / f"{name}_keypoints", settings)
+        run(work, "pictures", name, work / "runs" / f"{name}_locator", locator_settings(scale.locator_minutes))
 
 
-def keypoint_settings(scale: Scale, init: Path | None) -> TrainSettings:
-    return TrainSettings(
-        "gknet-s", epochs=scale.keypoint_epochs, stages=KEYPOINT_STAGES, validations=6, seed=SEED, init=init
-    )
+def run(work: Path, data: str, name: str, out: Path, settings: TrainSettings) -> None:
+    """One training, from where it stopped; crops or small pictures to learn from, whole frames to validate on."""
+    train(work / data, name, out, settings, (out / CHECKPOINT).exists(), work / "cache", val=work / "frames")
+
+
+def keypoint_settings(minutes: float, stages: tuple[Stage, ...], init: Path | None) -> TrainSettings:
+    return TrainSettings("gknet-s", minutes=minutes, stages=stages, validations=4, val_frames=100, seed=SEED, init=init)
+
+
+def locator_settings(minutes: float) -> TrainSettings:
+    return TrainSettings("locator", minutes=minutes, validations=2, val_frames=100, seed=SEED)
 
 
 def ship(work: Path, out: Path) -> None:
@@ -99,7 +109,9 @@ def judge(work: Path, models: Path, results: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="folder of data, caches and runs (30 GB at full scale)")
+    parser.add_argument(
+        "--work", type=Path, required=True, help="folder of data, caches and runs (30 GB at full scale)"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder of the exported models")
     parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
     parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")

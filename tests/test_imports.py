@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import gknet
+
 SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 
 LAYERS = (
@@ -110,17 +112,29 @@ def loaded_by(code: str) -> set[str]:
     return set(run.stdout.split("MODULES", 1)[1].split())
 
 
+def test_the_package_alone_loads_no_library() -> None:
+    assert not loaded_by("import gknet") & (HEAVY | {"cv2", "numpy", "onnxruntime", "poselib", "pydantic", "scipy"})
+
+
 @pytest.mark.parametrize(
     "code",
     [
-        "import gknet",
-        "import gknet.estimator, gknet.metrics, gknet.onnx_network, gknet.fleet, gknet.dataset.skd, gknet.video",
+        "import gknet\nfor name in gknet.__all__: getattr(gknet, name)",
+        "import gknet.evaluation, gknet.fleet, gknet.prediction, gknet.report.page",
         "import gknet.cli.main as m\nsys.argv = ['gknet', '--help']\ntry:\n    m.main()\nexcept SystemExit: pass",
     ],
-    ids=["gknet", "the runtime", "gknet --help"],
+    ids=["every name", "the runtime", "gknet --help"],
 )
 def test_light_things_load_nothing_heavy(code: str) -> None:
     assert not loaded_by(code) & HEAVY
+
+
+def test_every_name_is_there() -> None:
+    for name in gknet.__all__:
+        assert getattr(gknet, name).__name__ == name
+        assert name in dir(gknet)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = gknet.nothing
 
 
 def seconds_to(code: str) -> float:

@@ -30,7 +30,8 @@ SURE_SCORE = 0.3
 class Looking:
     """How an image is looked at.
 
-    input_size     of both networks, in pixels
+    input_size     side of the keypoint network's input in pixels
+    locator_size   side of the locator's
     min_located    the locator's peak below which there is no spacecraft
     relook_below   a first box smaller than this part of the locator's view is located again in a crop about it
     refine_crop    look once more where the keypoints say that the crop was off ...
@@ -38,6 +39,7 @@ class Looking:
     """
 
     input_size: int = 256
+    locator_size: int = 256
     min_located: float = 0.1
     relook_below: float = 0.0
     refine_crop: bool = True
@@ -105,11 +107,11 @@ class Estimator:
         image = check_image(image)
         height, width = image.shape[:2]
         side = max(width, height)
-        whole = Crop((width - side) // 2, (height - side) // 2, side, self.looking.input_size)
+        whole = Crop((width - side) // 2, (height - side) // 2, side, self.looking.locator_size)
         box = self._locate_in(image, whole)
         if box is None or box.side >= self.looking.relook_below * side:
             return box
-        return self._locate_in(image, Crop.around(box, self.looking.input_size, margin=3)) or box
+        return self._locate_in(image, Crop.around(box, self.looking.locator_size, margin=3)) or box
 
     def _locate_in(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> Box | None:
         if self.locator is None:
@@ -198,6 +200,9 @@ def load_estimator(name_or_folder: str | Path, threads: int | None = None, devic
         keypoint_network,
         keypoint_network.spacecraft,
         locator,
-        Looking(input_size=keypoint_network.metadata.input_size),
+        Looking(
+            input_size=keypoint_network.metadata.input_size,
+            locator_size=locator.metadata.input_size if locator else Looking.locator_size,
+        ),
         Decoding(covariance_scale=keypoint_network.metadata.covariance_scale),
     )

@@ -35,7 +35,7 @@ def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 5
 
 
 def test_a_cached_row_is_the_frame_through_a_crop() -> None:
-    frame = a_frame()
+    frame = a_frame((0.3, -0.2, 30.0))
     row = cached_row(frame, POINTS, "craft", 160)
     box = frame.true_box(POINTS)
     assert row is not None

@@ -46,8 +46,8 @@ def evaluate(
 
 def evaluate_section(dataset: SkdDataset, estimator: Estimator, words: str, pictures: int) -> Section:
     """Evaluate with a progress bar, with the pictures for the page. Without a locator only the oracle's crop is run."""
-    from gknet.progress import progress
     from gknet.evaluation import PROTOCOL_WORDS, evaluate
+    from gknet.progress import progress
     from gknet.report.gallery import galleries
     from gknet.report.page import Section
 

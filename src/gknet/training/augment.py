@@ -118,7 +118,7 @@ def _add_noise(rng: np.random.Generator, image: UInt8[ndarray, "s s 3"], sigma: 
     return cv2.add(image, noise, dtype=cv2.CV_8U)
 
 
-def _tone(rng: np.random.Generator, ranges: Augmentation) -> UInt8[ndarray, "256 1"]:
+def _tone(rng: np.random.Generator, ranges: Augmentation) -> UInt8[ndarray, "256"]:
     """Gamma, gain and offset as one table."""
     gamma = math.exp(rng.uniform(-ranges.gamma, ranges.gamma))
     gain = math.exp(rng.uniform(*np.log(ranges.gain)))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -30,6 +30,7 @@ LAYOUT = 1
 Window = Literal["craft", "picture"]
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """A dataset whose labels can be read without its pictures."""
 

@@ -156,7 +156,7 @@ def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:
         "graph": run.graph,
         "spacecraft": run.spacecraft_toml,
         "stride": network.stride,
-        "input_size": network.input_size,
+        "input_size": run.input_size,
         "tolerance": tolerance,
         "covariance_scale": best.get("covariance_scale", 1.0),
         "validation": best,
@@ -182,7 +182,7 @@ def export_run(folder: Path, out: Path, tolerance: float = TOLERANCE) -> Exporte
     network.eval()
     small = folded(network)
     round_weights(small)
-    images = example_images(network.input_size, Path(run.data))
+    images = example_images(run.input_size, Path(run.data))
     model = onnx_graph(small, torch.from_numpy(images[:2]))
     store_in_half(model)
     about = metadata(run, network, tolerance)

@@ -85,7 +85,16 @@ def train(
     identity = f"{settings.network}, {spacecraft.name} with {spacecraft.keypoint_count} keypoints, seed {settings.seed}"
     state = load_checkpoint(out, network, average, optimizer, identity) if resume else State()
     toml = spacecraft_toml(replace(spacecraft, mesh_path=None))
-    run = Run(settings.network, settings.graph, toml, asdict(settings), __version__, str(data), state.best)
+    run = Run(
+        settings.network,
+        settings.graph,
+        settings.input_size,
+        toml,
+        asdict(settings),
+        __version__,
+        str(data),
+        state.best,
+    )
     budget = Budget(settings.minutes, None if settings.epochs is None else round(settings.epochs * len(cache)))
     stages = settings.input_stages
     started = time.monotonic() - state.elapsed_s
@@ -122,7 +131,8 @@ def train(
                 for group in optimizer.param_groups:
                     group["lr"] = rate
                 model.train()
-                loss = task.loss(model, batch, fabric.device)
+                with fabric.autocast():  # Fabric itself casts in forward() alone, not in the other methods
+                    loss = task.loss(model, batch, fabric.device)
                 optimizer.zero_grad()
                 fabric.backward(loss)
                 fabric.clip_gradients(model, optimizer, max_norm=settings.clip, error_if_nonfinite=False)

@@ -77,6 +77,11 @@ class TrainSettings:
         return self.stages or STAGES[self.network]
 
     @property
+    def input_size(self) -> int:
+        """Side of the input in pixels at which the network is validated and deployed: the last stage's."""
+        return self.input_stages[-1].input_size
+
+    @property
     def window(self) -> Window:
         """What of a frame the network sees."""
         return "picture" if self.network == "locator" else "craft"
@@ -93,6 +98,7 @@ class Run:
 
     network: str
     graph: str
+    input_size: int
     spacecraft_toml: str
     settings: dict[str, object]
     version: str

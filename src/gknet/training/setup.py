@@ -61,8 +61,8 @@ def make_fabric(settings: TrainSettings) -> Fabric:
 
 def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings) -> Task:
     if isinstance(network, Locator):
-        return LocatorTask(spacecraft, network.stride, network.input_size, settings.sigma_cells)
-    return KeypointTask(spacecraft, network.stride, network.input_size, settings.sigma_cells, settings.auxiliary)
+        return LocatorTask(spacecraft, network.stride, settings.input_size, settings.sigma_cells)
+    return KeypointTask(spacecraft, network.stride, settings.input_size, settings.sigma_cells, settings.auxiliary)
 
 
 def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
@@ -70,7 +70,7 @@ def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.O
     matrices = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=settings.learning_rate)
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
 
 
 @torch.no_grad()

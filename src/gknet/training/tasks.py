@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from gknet.training.loss import gaussian_targets, heatmap_loss, locator_loss
 from gknet.training.validation import Validation, validate_keypoints, validate_locator
 
 
+@runtime_checkable
 class Task(Protocol):
     @property
     def draw(self) -> Draw: ...

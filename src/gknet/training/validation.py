@@ -109,7 +109,7 @@ def validate_locator(
     """Overlap of the located with the true boxes; the score is 1 minus the part that reaches 0.7, plus the mean gap."""
     network.eval()
     run = numpy_network(network, device)
-    estimator = Estimator(run, spacecraft, locator=run, looking=Looking(input_size=input_size))
+    estimator = Estimator(run, spacecraft, locator=run, looking=Looking(locator_size=input_size))
     overlaps = []
     for frame in _usable(frames, rows, spacecraft):
         assert frame.image is not None
