@@ -97,7 +97,7 @@ def ship(work: Path, out: Path) -> None:
 
 
 def judge(work: Path, models: Path, results: Path) -> None:
-    """The test sequences of both recipes, oracle crop and detected crop; only the figures are kept in the repository."""
+    """The test sequences of both recipes, oracle crop and detected crop; the repository keeps the figures alone."""
     for name in NAMES:
         for data in ("frames", "hard"):
             pages = work / "evaluation" / f"{name}_{data}"
