@@ -7,6 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+CENTRE_WEIGHT = 0.1
+"""Of the centre's map in the locator's loss. Its cross-entropy, summed over the cells, would drown the box's part."""
+
 
 def gaussian_targets(
     points_px: Float[Tensor, "b n 2"], stride: int, height: int, width: int, sigma_cells: float
@@ -67,4 +70,4 @@ def locator_loss(
     boxes = [torch.cat([-d[:, :2], d[:, 2:]], dim=1).movedim(1, -1) for d in (distance, true)]
     overlap = 1 - box_iou(boxes[0], boxes[1])
     box_loss = ((10 * l1 + 2 * overlap) * share).sum(dim=(1, 2))
-    return centre_loss + (box_loss * seen).sum() / seen.sum().clamp(min=1)
+    return CENTRE_WEIGHT * centre_loss + (box_loss * seen).sum() / seen.sum().clamp(min=1)
