@@ -1,0 +1,103 @@
+"""The model cards and the README's table, from the figures that recipes/shipped_models.py left.
+
+    python recipes/shipped_tables.py --models src/gknet/models --results results/shipped_models
+
+Hardware   any
+Time       a second
+Expected   a README.md beside each model, and the tables on the terminal
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+
+from gknet.atomic import write_text
+from gknet.fleet import NAMES
+from gknet.onnx_network import METADATA_KEY
+
+PROTOCOLS = {"oracle": "oracle crop", "detected": "detected crop"}
+COLUMNS = {
+    "rmse_px": "RMSE px",
+    "rmse_hidden_px": "RMSE hidden px",
+    "pck_5": "PCK 5 px",
+    "e_t": "E_t",
+    "e_q_rad": "E_q rad",
+    "speed_score": "SPEED score",
+    "add": "ADD, diameters",
+}
+
+
+def statistic(run: dict[str, Any], name: str) -> str:
+    """Mean [95 % interval], median."""
+    found = run["metrics"].get(name)
+    if found is None:
+        return ""
+    return f"{found['mean']:.3g} [{found['low']:.3g}, {found['high']:.3g}], {found['median']:.3g}"
+
+
+def table(results: Path, recipe: str) -> str:
+    """Markdown: a row for each spacecraft and crop."""
+    lines = [
+        "| spacecraft, crop | frames | no pose | " + " | ".join(COLUMNS.values()) + " | IoU >= 0.7 |",
+        "|---" * (len(COLUMNS) + 4) + "|",
+    ]
+    for name in NAMES:
+        runs = json.loads((results / f"{name}_{recipe}.json").read_text(encoding="utf-8"))["runs"]
+        for protocol, words in PROTOCOLS.items():
+            run = runs[protocol]
+            located = "" if protocol == "oracle" else f"{100 * run['located_07']:.1f} %"
+            cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
+            cells += [statistic(run, column) for column in COLUMNS]
+            lines.append("| " + " | ".join([*cells, located]) + " |")
+    return "\n".join(lines)
+
+
+def card(models: Path, results: Path, name: str) -> str:
+    """What is known of one spacecraft's two networks."""
+    lines = [f"# gknet models of {name}", ""]
+    lines += ["Trained on rendered pictures alone (recipe `skd`, seed 0), by `recipes/shipped_models.py`.", ""]
+    lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
+    for kind in ("keypoints", "locator"):
+        path = models / name / f"{kind}.onnx"
+        session = onnxruntime.InferenceSession(str(path))
+        about = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+        best = ", ".join(f"{key} {value:.3g}" for key, value in about["validation"].items())
+        size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
+        lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
+    for recipe in ("skd", "skd-hard"):
+        runs = json.loads((results / f"{name}_{recipe}.json").read_text(encoding="utf-8"))["runs"]
+        lines += ["", f"## {recipe}, test sequences: mean [95 % interval over sequences], median", ""]
+        lines += ["| | " + " | ".join(PROTOCOLS.values()) + " |", "|---" * 3 + "|"]
+        for column, words in COLUMNS.items():
+            cells = [statistic(runs[protocol], column) for protocol in PROTOCOLS]
+            lines.append(f"| {words} | " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        "## Limits",
+        "",
+        "Never shown a real photograph. Made for spans of 8 to 90 % of a 1024 px frame; another camera works through its",
+        "matrix, a span far outside that does not. A frame in which symmetric parts look the same can give a wrong attitude",
+        "with a small reprojection error. Weights are stored in 16 bits.",
+        "Licence: Apache-2.0, as the package.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--models", type=Path, required=True, help="folder of the exported models")
+    parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
+    arguments = parser.parse_args()
+    for name in NAMES:
+        write_text(arguments.models / name / "README.md", card(arguments.models, arguments.results, name))
+    for recipe in ("skd", "skd-hard"):
+        print(f"\n{recipe}: mean [95 % interval over sequences], median\n\n{table(arguments.results, recipe)}")
+
+
+if __name__ == "__main__":
+    main()
