@@ -138,7 +138,9 @@ def test_exports_agree_with_torch_and_know_what_they_are(finished: Path, located
         assert network.metadata.kind == kind
         assert network.metadata.stride == 4
         assert network.spacecraft.name == "satellite_01"
-        assert network(np.zeros((2, 3, 256, 256), np.float32)).shape == (2, channels, 64, 64)
+        size = network.metadata.input_size
+        assert size == load_run(run).input_size == 64  # the last stage's
+        assert network(np.zeros((2, 3, size, size), np.float32)).shape == (2, channels, size // 4, size // 4)
         assert result.onnx_path.stat().st_size < 0.65 * 4 * sum(t.numel() for t in load_weights(run / BEST).values())
         again = load_weights(result.weights_path)
         for name, tensor in load_weights(run / BEST).items():

@@ -61,11 +61,11 @@ def train(
     cv2.setNumThreads(1)
     if not resume and (out / CHECKPOINT).exists():
         raise GknetError(f"{out}: it holds a training already; --resume goes on with it, or choose another folder")
-    fabric = make_fabric(settings)
-    torch.manual_seed(settings.seed)
     training_data = SkdDataset(data, "train", spacecraft_name)
     val_data = SkdDataset(val or data, "val", spacecraft_name)
     spacecraft = training_data.spacecraft
+    fabric = make_fabric(settings)
+    torch.manual_seed(settings.seed)
     rows = validation_rows(len(val_data), settings.val_frames)
     out.mkdir(parents=True, exist_ok=True)
     with fabric.rank_zero_first():
