@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import gknet.estimator as estimating
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, Looking, check_image, load_estimator, shipped_models
 from gknet.frame import Box, Frame
 from gknet.geometry import Camera, Pose
 from gknet.metrics import errors
-from gknet.pnp import PnpSettings
+from gknet.pnp import PnpResult, PnpSettings
 from gknet.spacecraft import Spacecraft, spacecraft_toml
 from tests.test_decode import gaussians, locator_output
 
@@ -170,6 +171,22 @@ def test_failures_are_values_with_reasons() -> None:
     assert estimate.keypoints is not None
     lost = Estimator(estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32))
     assert lost.estimate(frame.image, CAMERA).failure == "the locator sees no spacecraft"
+
+
+@pytest.mark.parametrize("range_factor", [0.02, 100.0])
+def test_a_pose_of_another_size_than_the_crop_is_refused(range_factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, frame = perfect(POSES["middle"])
+    true_solve = estimating.solve_pnp
+
+    def solve(*arguments: object) -> PnpResult:
+        result = true_solve(*arguments)
+        pose = result.cam_from_body
+        return replace(result, cam_from_body=Pose(pose.rotation, pose.translation_m * range_factor))
+
+    monkeypatch.setattr(estimating, "solve_pnp", solve)
+    estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    assert estimate.cam_from_body is None
+    assert "crops large" in str(estimate.failure)
 
 
 def test_thresholds_are_in_pixels_of_the_input() -> None:

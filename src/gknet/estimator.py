@@ -15,12 +15,15 @@ from gknet.crop import Crop
 from gknet.decode import Decoding, decode_heatmaps, decode_locator, keypoints_to_image
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Keypoints
-from gknet.geometry import Camera
+from gknet.geometry import Camera, Pose
 from gknet.onnx_network import OnnxNetwork
 from gknet.pnp import PnpResult, PnpSettings, solve_pnp
 from gknet.spacecraft import Spacecraft
 
 Network = Callable[[Float32[ndarray, "b 3 size size"]], Float32[ndarray, "b c h w"]]
+
+PLAUSIBLE_SIZE = (0.25, 6.0)
+"""Projected diameter of the craft over the crop's side: less when it is seen end-on, more when it is cut off."""
 
 SURE_SCORE = 0.3
 """Keypoints from this score on say where a crop should have been."""
@@ -140,9 +143,16 @@ class Estimator:
         result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp)
         if not isinstance(result, PnpResult):
             return Estimate(keypoints, box=box, failure=result)
+        ratio = self._projected_diameter(result.cam_from_body, camera) / crop.side
+        if not PLAUSIBLE_SIZE[0] <= ratio <= PLAUSIBLE_SIZE[1]:
+            return Estimate(keypoints, box=box, failure=f"the pose makes the spacecraft {ratio:.2g} crops large")
         return Estimate(
             keypoints, result.cam_from_body, result.covariance, result.inliers, result.reprojection_rms_px, box
         )
+
+    def _projected_diameter(self, cam_from_body: Pose, camera: Camera) -> float:
+        """Pixels that the spacecraft's diameter spans across the line of sight, at its range."""
+        return float(camera.matrix[0, 0] * self.spacecraft.diameter_m / np.linalg.norm(cam_from_body.translation_m))
 
     def _better_crop(self, estimate: Estimate, camera: Camera, crop: Crop) -> Crop | None:
         """The crop about the keypoints found, when it overlaps little with the one they were found in."""

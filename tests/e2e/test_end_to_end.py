@@ -1,7 +1,7 @@
 """Render, train, export, predict and evaluate on the command line; the result must beat stated dumb baselines.
 
 The task is an easy one: two slow sequences, near and well lit, with the frames dealt out to train, val and test, so
-that a test frame lies about two degrees from a training frame. A training of about two minutes can learn that. It
+that a test frame lies about two degrees from a training frame. A training of about a minute can learn that. It
 shows that the rooms fit together and that training learns; how good gknet is on sequences that it never saw is
 measured elsewhere.
 """
@@ -112,7 +112,7 @@ def test_keypoints_beat_the_constant_predictor(
 ) -> None:
     baseline, found = constant_rmse_px(products), metrics["oracle"]["rmse_px"]["mean"]
     print(f"RMSE, oracle crop: {found:.1f} px, constant predictor {baseline:.1f} px")
-    assert found < 0.6 * baseline
+    assert found < 0.4 * baseline
 
 
 def attitudes(dataset: SkdDataset) -> Rotation:
@@ -131,7 +131,7 @@ def test_attitudes_beat_the_constant_predictor(
 ) -> None:
     """Failures count as pi."""
     baseline = constant_e_q_rad(products)
-    for protocol, share in (("oracle", 0.5), ("detected", 0.9)):
+    for protocol, share in (("oracle", 0.3), ("detected", 0.5)):
         found = metrics[protocol]["e_q_rad"]["mean"]
         print(f"E_q, {protocol} crop: {found:.2f} rad, constant predictor {baseline:.2f} rad")
         assert found < share * baseline
@@ -143,7 +143,7 @@ def test_locator_beats_the_whole_picture(products: Products, metrics: dict[str, 
     baseline = float(np.mean([box.area / 256**2 for box in boxes if box is not None]))
     found = metrics["detected"]["locator_iou"]["mean"]
     print(f"IoU: {found:.2f}, whole picture {baseline:.2f}")
-    assert found > max(0.4, 2 * baseline)
+    assert found > max(0.6, 2 * baseline)
 
 
 def test_prediction_writes_a_line_for_each_picture(products: Products, tmp_path: Path) -> None:
