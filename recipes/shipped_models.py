@@ -4,7 +4,7 @@
     python recipes/shipped_models.py --work runs/shipped --out src/gknet/models --results results/shipped_models
 
 Hardware   2 CPU cores with bfloat16 (AVX-512), no GPU
-Time       about 25 minutes of rendering, then 17 minutes for the first weights and about 14 a spacecraft
+Time       about 25 minutes of rendering, then 17 minutes for the first weights and 8 to 15 a spacecraft
 Expected   the table of README.md, printed from results/shipped_models/*/metrics.json
 
 Every stage keeps what is done: run the command again after an interruption. Only train sequences are trained on, val
@@ -52,7 +52,7 @@ class Scale:
 
 
 SCALES = {
-    "cpu": Scale(2, 6, 30, 15, 17, (10, 13, 12), 2, KEYPOINT_STAGES),
+    "cpu": Scale(2, 6, 30, 15, 17, (5, 11.5, 9.5), 3, KEYPOINT_STAGES),
     "full": Scale(1, 1, 10, 1, 60, (600, 600, 600), 60, FULL_STAGES),
 }
 
