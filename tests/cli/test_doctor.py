@@ -46,6 +46,12 @@ def test_core_is_well() -> None:
     assert "CPUExecutionProvider" in doctor._providers().words
 
 
+def test_shipped_models_are_well() -> None:
+    findings = list(doctor._models())
+    assert [finding.what for finding in findings] == [f"model satellite_0{k}" for k in (1, 2, 3)]
+    assert all(finding.state is State.good for finding in findings), findings
+
+
 def test_model_is_run(model: Callable[[ToyModel], None]) -> None:
     model(ToyModel())
     (finding,) = doctor._models()

@@ -130,13 +130,13 @@ def _try_model(name: str) -> str:
     from gknet.estimator import load_estimator
 
     estimator = load_estimator(name)
-    size = estimator.looking.input_size
-    image = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
-    expected = {"keypoints": (estimator.keypoint_network, estimator.spacecraft.keypoint_count)}
+    looking = estimator.looking
+    expected = {"keypoints": (estimator.keypoint_network, looking.input_size, estimator.spacecraft.keypoint_count)}
     if estimator.locator is not None:
-        expected["locator"] = (estimator.locator, 5)
+        expected["locator"] = (estimator.locator, looking.locator_size, 5)
     words = []
-    for kind, (network, channels) in expected.items():
+    for kind, (network, size, channels) in expected.items():
+        image = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
         first = network(image)
         start = time.perf_counter()
         second = network(image)
