@@ -8,7 +8,8 @@ Time       about 25 minutes of rendering, then 17 minutes for the first weights 
 Expected   the table of README.md, printed from results/shipped_models/*/metrics.json
 
 Every stage keeps what is done: run the command again after an interruption. Only train sequences are trained on, val
-sequences choose the weights and scale the covariances, and test sequences are looked at once, by `evaluate`.
+sequences choose the weights and scale the covariances, and test sequences serve `judge` alone. README.md and
+docs/experiments.md say where the making of the weights that ship differed from this.
 """
 
 from __future__ import annotations

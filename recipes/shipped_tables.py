@@ -62,7 +62,10 @@ def table(results: Path, recipe: str) -> str:
 def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
-    lines += ["Trained on rendered pictures alone (recipe `skd`, seed 0), by `recipes/shipped_models.py`.", ""]
+    lines += [
+        "Trained on rendered pictures alone (recipe `skd`, seed 0), by the stages of `recipes/shipped_models.py`; the package's README says where the run differed.",
+        "",
+    ]
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
     for kind in ("keypoints", "locator"):
         path = models / name / f"{kind}.onnx"
