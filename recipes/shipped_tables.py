@@ -63,7 +63,8 @@ def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
     lines += [
-        "Trained on rendered pictures alone (recipe `skd`, seed 0), by the stages of `recipes/shipped_models.py`; the package's README says where the run differed.",
+        "Trained on rendered pictures alone (recipe `skd`, seed 0), by the stages of `recipes/shipped_models.py`;",
+        "the package's README says where the runs differed from it.",
         "",
     ]
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]

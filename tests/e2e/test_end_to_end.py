@@ -169,8 +169,8 @@ def test_rendering_again_changes_nothing(products: Products) -> None:
 def test_bad_input_ends_with_one_line_and_code_2(products: Products, tmp_path: Path) -> None:
     (tmp_path / "torn.jpg").write_bytes(b"\xff\xd8\xff\xe0 no picture")
     for words in (
-        ("predict", tmp_path / "absent.jpg", "--model", products.model, "--focal-px", 1400),
-        ("predict", tmp_path / "torn.jpg", "--model", products.model, "--focal-px", 1400),
+        ("predict", tmp_path / "absent.jpg", "--model", products.model, "--focal-px", 1400, "--out", tmp_path),
+        ("predict", tmp_path / "torn.jpg", "--model", products.model, "--focal-px", 1400, "--out", tmp_path),
         ("eval", tmp_path, "--model", products.model),
         ("export", tmp_path, "--out", tmp_path / "model"),
         ("train", tmp_path, "--out", tmp_path / "run", "--spacecraft", CRAFT, "--minutes", 1),
