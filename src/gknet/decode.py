@@ -1,6 +1,7 @@
 """Heatmaps to keypoints, below the cell, each with a covariance; and the locator's maps to a box.
 
-Training by the mean squared error makes a heatmap the target Gaussian averaged over what the network deems possible.
+A heatmap is the target Gaussian averaged over what the network deems possible: training by squared error tends to it,
+training by likelihood says it outright (decision 0007).
 If that spread has covariance C and the peak value is p, then the heatmap's own local covariance M is the target's
 plus C, and for a round spread C = M (1 - p). So peak and width together tell how far the keypoint may be off. Here
 C = M (1 - p) / p + floor: equal to it near p = 1, and wider where a low peak says that mass sits elsewhere.

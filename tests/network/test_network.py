@@ -8,10 +8,17 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import position_code  # noqa: E402
+from gknet.network.backbone import (  # noqa: E402
+    SHARPNESS,
+    SIGMA_CELLS,
+    expected_heatmaps,
+    log_belief,
+    position_code,
+)
 from gknet.network.build import build, configured, gknet_paper, gknet_s, locator  # noqa: E402
 from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
 from gknet.network.graph import Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
+from gknet.training.loss import gaussian_targets  # noqa: E402
 
 
 def chain(count: int) -> np.ndarray:
@@ -38,12 +45,21 @@ def test_any_number_of_keypoints_and_any_input_size(count: int, size: int) -> No
 
 
 @pytest.mark.parametrize("graph", ["skeleton", "identity", "none"])
-def test_the_forward_pass_is_the_fused_branches(graph: str) -> None:
+def test_the_forward_pass_is_the_belief_of_the_fused_branches(graph: str) -> None:
     network = tiny(5, graph).eval()
     image = torch.rand(1, 3, 64, 64)
     branches = network.branches(image)
-    assert torch.equal(network(image), branches.heatmaps)
+    torch.testing.assert_close(network(image), expected_heatmaps(branches.fused))
     assert (branches.nodes is None) == (graph == "none")
+
+
+def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
+    maps = torch.randn(2, 3, 16, 16)
+    torch.testing.assert_close(log_belief(maps).exp().sum(dim=2), torch.ones(2, 3))
+    target = gaussian_targets(torch.tensor([[[33.0, 30.5]]]), 4, 16, 16, SIGMA_CELLS)
+    torch.testing.assert_close(expected_heatmaps(target.log() / SHARPNESS), target, atol=1e-4, rtol=0)
+    twins = (target + target.flip(3)) / 2  # two places, equally likely: two peaks of half the height
+    torch.testing.assert_close(expected_heatmaps(twins.log() / SHARPNESS), twins, atol=1e-4, rtol=0)
 
 
 def test_without_edges_the_size_is_the_same() -> None:
@@ -110,13 +126,13 @@ def test_at_the_start_both_branches_reach_the_output_channel_by_channel() -> Non
 def test_at_the_start_the_graph_does_not_drown_the_other_branch() -> None:
     branches = gknet_s(chain(16)).branches(torch.rand(2, 3, 128, 128))
     assert branches.nodes is not None
-    assert branches.heatmaps.abs().max() < 1
+    assert branches.fused.abs().max() < 1
     assert branches.nodes.abs().mean() < 0.1
 
 
 def test_gradients_reach_every_parameter() -> None:
     network = tiny(5)
-    (network(torch.rand(2, 3, 64, 64)) - 1).square().sum().backward()
+    (network.branches(torch.rand(2, 3, 64, 64)).fused - 1).square().sum().backward()
     assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
 
 

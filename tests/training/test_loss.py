@@ -7,8 +7,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from gknet.decode import decode_heatmaps, decode_locator  # noqa: E402
-from gknet.training.loss import box_iou, gaussian_targets, heatmap_loss, locator_loss  # noqa: E402
+from gknet.decode import SPREAD_CELLS, decode_heatmaps, decode_locator  # noqa: E402
+from gknet.network.backbone import SHARPNESS, SIGMA_CELLS  # noqa: E402
+from gknet.training.loss import (  # noqa: E402
+    box_iou,
+    gaussian_targets,
+    heatmap_loss,
+    likelihood_loss,
+    locator_loss,
+)
 
 
 def test_targets_are_gaussians_about_sub_pixel_centres() -> None:
@@ -22,6 +29,10 @@ def test_targets_are_gaussians_about_sub_pixel_centres() -> None:
     assert targets[0, 0].argmax().item() == i * 64 + j
     half_a_pixel = gaussian_targets(points + 0.5, 4, 64, 64, 1.5)
     assert (targets - half_a_pixel).abs().max() > 0.01
+
+
+def test_the_decoder_expects_the_width_that_is_trained() -> None:
+    assert SPREAD_CELLS == SIGMA_CELLS
 
 
 @pytest.mark.parametrize(("stride", "cells"), [(4, 64), (4, 32), (8, 32)])
@@ -44,6 +55,22 @@ def test_the_loss_is_zero_on_the_truth_and_blind_to_masked_keypoints() -> None:
     wrong[1, 2, 4, 4] += 2
     assert heatmap_loss(wrong, targets, weight).item() == pytest.approx(4 / 9, rel=1e-5)
     assert heatmap_loss(wrong, targets, torch.zeros(2, 5)) == 0
+
+
+def test_the_likelihood_loss_is_zero_on_the_truth_and_blind_to_masked_keypoints() -> None:
+    points = 16 + torch.rand(2, 5, 2) * 32  # far from their mirror images
+    targets = gaussian_targets(points, 4, 32, 32, SIGMA_CELLS)
+    maps = targets.clamp(min=1e-30).log() / SHARPNESS
+    weight = torch.ones(2, 5)
+    assert likelihood_loss(maps, targets, weight).item() == pytest.approx(0, abs=1e-5)
+    assert likelihood_loss(maps + 3, targets, weight).item() == pytest.approx(0, abs=1e-5)  # a constant is no belief
+    twins = torch.logaddexp(maps * SHARPNESS, maps.flip(3) * SHARPNESS) / SHARPNESS
+    assert likelihood_loss(twins, targets, weight).item() == pytest.approx(np.log(2), rel=0.2)
+    maps[0, 3] = torch.rand(32, 32)
+    assert likelihood_loss(maps, targets, weight) > 0.1
+    weight[0, 3] = 0
+    assert likelihood_loss(maps, targets, weight).item() == pytest.approx(0, abs=1e-5)
+    assert likelihood_loss(maps, targets, torch.zeros(2, 5)) == 0
 
 
 def test_iou_of_boxes() -> None:

@@ -12,7 +12,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.errors import GknetError
-from gknet.network.backbone import POSITION_WIDTH, ContextBlock, ConvNorm, Encoder, Pyramid, position_code
+from gknet.network.backbone import (
+    POSITION_WIDTH,
+    ContextBlock,
+    ConvNorm,
+    Encoder,
+    Pyramid,
+    expected_heatmaps,
+    position_code,
+)
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
 
 COARSEST = 32
@@ -48,9 +56,9 @@ class GKNetConfig:
 
 
 class Branches(NamedTuple):
-    """The answer and its two parts. `nodes` is None without a graph branch."""
+    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch."""
 
-    heatmaps: Tensor
+    fused: Tensor
     pixels: Tensor
     nodes: Tensor | None
 
@@ -63,8 +71,12 @@ def check_input(image: Tensor) -> None:
 
 
 class GKNet(nn.Module):
-    """Image -> one heatmap per keypoint, peak near 1, at a quarter of the input's resolution."""
+    """Image -> one heatmap per keypoint, peak near 1, at a quarter of the input's resolution.
 
+    Its maps are logits of where the keypoint is (decision 0007); `forward` turns them into heatmaps.
+    """
+
+    likelihood = True
     stride = 4
     input_size = 256
 
@@ -99,10 +111,10 @@ class GKNet(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h4 w4"]:
         """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
-        return self.branches(image).heatmaps
+        return expected_heatmaps(self.branches(image).fused)
 
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
-        """The heatmaps and what each branch contributed, for a loss on both."""
+        """The maps and what each branch contributed, for a loss on both."""
         check_input(image)
         features = self.encoder(image)
         coarse = features[3]

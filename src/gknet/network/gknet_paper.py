@@ -42,6 +42,7 @@ def _level(inputs: int, outputs: int) -> nn.Sequential:
 class GKNetPaper(nn.Module):
     """Image -> one heatmap per keypoint at an eighth of the input's resolution: 256 -> 32."""
 
+    likelihood = False
     stride = 8
     input_size = 256
 
@@ -70,7 +71,7 @@ class GKNetPaper(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h8 w8"]:
         """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
-        return self.branches(image).heatmaps
+        return self.branches(image).fused
 
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
         check_input(image)

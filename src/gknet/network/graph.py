@@ -92,17 +92,17 @@ class GraphDecoder(nn.Module):
 class Fusion(nn.Module):
     """The maps of both branches, joined by a 1x1 convolution.
 
-    Their product comes along, so that a node can veto a twin's peak. At the start the output is the up-sampling
-    branch's map plus the node's map, keypoint by keypoint: neither branch starves the other.
+    At the start the output is the up-sampling branch's map plus the node's map, keypoint by keypoint: neither branch
+    starves the other, and where the maps are logits a node can veto a twin's peak.
     """
 
     def __init__(self, keypoints: int) -> None:
         super().__init__()
-        self.join = nn.Conv2d(3 * keypoints, keypoints, 1)
+        self.join = nn.Conv2d(2 * keypoints, keypoints, 1)
         one = torch.eye(keypoints)
         with torch.no_grad():
-            self.join.weight.copy_(torch.cat([one, one, 0 * one], dim=1)[:, :, None, None])
+            self.join.weight.copy_(torch.cat([one, one], dim=1)[:, :, None, None])
             nn.init.zeros_(self.join.bias)  # type: ignore[arg-type]
 
     def forward(self, pixels: Float[Tensor, "b n h w"], nodes: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"]:
-        return self.join(torch.cat([pixels, nodes, pixels * nodes], dim=1))
+        return self.join(torch.cat([pixels, nodes], dim=1))

@@ -7,6 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from gknet.network.backbone import log_belief
+
+TINY = 1e-12
+
 CENTRE_WEIGHT = 0.1
 """Of the centre's map in the locator's loss. Its cross-entropy, summed over the cells, would drown the box's part."""
 
@@ -32,6 +36,20 @@ def heatmap_loss(
     """
     error = (heatmaps.float() - targets).square().sum(dim=(2, 3))
     return (error * weight).sum() / weight.sum().clamp(min=1)
+
+
+def likelihood_loss(
+    maps: Float[Tensor, "b n h w"], targets: Float[Tensor, "b n h w"], weight: Float[Tensor, "b n"]
+) -> Float[Tensor, ""]:
+    """Divergence of the believed cells from the target Gaussian, averaged over the keypoints in view.
+
+    0 at best. Unlike the squared error it is not nearly flat about maps without any peak, and it charges a belief
+    for what it excludes.
+    """
+    wanted = targets.flatten(2)
+    wanted = wanted / wanted.sum(dim=2, keepdim=True).clamp(min=TINY)
+    divergence = (wanted * (wanted.clamp(min=TINY).log() - log_belief(maps))).sum(dim=2)
+    return (divergence * weight).sum() / weight.sum().clamp(min=1)
 
 
 def box_iou(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b"]:

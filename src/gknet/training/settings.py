@@ -27,7 +27,6 @@ class TrainSettings:
 
     minutes, epochs   the budget: exactly one of them
     stages            None takes the network's own (STAGES)
-    sigma_cells       of the Gaussian targets, in heatmap cells
     warm_up           share of the budget in which the learning rate rises
     ema               how much of the averaged weights stays at each step
     auxiliary         weight of the loss on each branch's own maps
@@ -46,7 +45,6 @@ class TrainSettings:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
     warm_up: float = 0.03
-    sigma_cells: float = 1.5
     auxiliary: float = 0.2
     ema: float = 0.997
     clip: float = 5.0
@@ -66,7 +64,7 @@ class TrainSettings:
         checked_graph(self.graph)
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
-        for name in ("learning_rate", "sigma_cells", "clip", "devices", "val_frames", "validations", "cache_size"):
+        for name in ("learning_rate", "clip", "devices", "val_frames", "validations", "cache_size"):
             if getattr(self, name) <= 0:
                 raise GknetError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if not 0 <= self.ema < 1 or not 0 <= self.warm_up < 1:

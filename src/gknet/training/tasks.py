@@ -11,10 +11,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gknet.frame import Frame
+from gknet.network.backbone import SIGMA_CELLS
 from gknet.network.gknet import Branches
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
-from gknet.training.loss import gaussian_targets, heatmap_loss, locator_loss
+from gknet.training.loss import gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
 from gknet.training.validation import Validation, validate_keypoints, validate_locator
 
 
@@ -31,23 +32,27 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class KeypointTask:
-    """Heatmaps against Gaussians; `auxiliary` is the weight of each branch's own loss."""
+    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss.
+
+    likelihood  the maps are logits of the cell, not heatmaps
+    """
 
     spacecraft: Spacecraft
     stride: int
     input_size: int
-    sigma_cells: float
     auxiliary: float
+    likelihood: bool
     draw: Draw = draw_keypoints
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
         branches: Branches = network.branches(batch.network_input(device))  # type: ignore[operator]
-        height, width = branches.heatmaps.shape[2:]
+        height, width = branches.fused.shape[2:]
         points, weight = batch.points_px.to(device), batch.weight.to(device)
-        targets = gaussian_targets(points, self.stride, height, width, self.sigma_cells)
-        loss = heatmap_loss(branches.heatmaps, targets, weight)
+        targets = gaussian_targets(points, self.stride, height, width, SIGMA_CELLS)
+        measure = likelihood_loss if self.likelihood else heatmap_loss
+        loss = measure(branches.fused, targets, weight)
         if self.auxiliary > 0 and branches.nodes is not None:
-            parts = heatmap_loss(branches.pixels, targets, weight) + heatmap_loss(branches.nodes, targets, weight)
+            parts = measure(branches.pixels, targets, weight) + measure(branches.nodes, targets, weight)
             loss = loss + self.auxiliary * parts
         return loss
 
@@ -64,13 +69,12 @@ class LocatorTask:
     spacecraft: Spacecraft
     stride: int
     input_size: int
-    sigma_cells: float
     draw: Draw = draw_box
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
         output = network(batch.network_input(device))
         corners, weight = batch.points_px.to(device), batch.weight.to(device)
-        return locator_loss(output, corners, weight, self.stride, self.sigma_cells)
+        return locator_loss(output, corners, weight, self.stride, SIGMA_CELLS)
 
     def validate(
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
