@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
+
 from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import (  # noqa: E402
-    SHARPNESS,
-    SIGMA_CELLS,
-    expected_heatmaps,
-    log_belief,
-    position_code,
+from gknet.network.backbone import position_code  # noqa: E402
+from gknet.network.build import (  # noqa: E402
+    build,
+    configured,
+    gknet_paper,
+    gknet_s,
+    hrnet,
+    hrnet_s,
+    locator,
+    resunet,
+    resunet_s,
 )
-from gknet.network.build import build, configured, gknet_paper, gknet_s, locator  # noqa: E402
 from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
 from gknet.network.graph import Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
+from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_belief  # noqa: E402
+from gknet.network.hrnet import HRNet, HRNetConfig  # noqa: E402
+from gknet.network.resunet import ResUNet, ResUNetConfig  # noqa: E402
 from gknet.training.loss import gaussian_targets  # noqa: E402
 
 
@@ -63,12 +74,65 @@ def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
 
 
 def test_without_edges_the_size_is_the_same() -> None:
-    assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton"))
+    assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton")) == parameters(tiny(9, "random"))
+    whole, without = parameters(gknet_s(chain(16))), parameters(gknet_s(chain(16), "none"))
+    assert abs(without / whole - 1) < 0.03
+
+
+def test_the_random_graph_has_as_many_edges_and_is_always_the_same() -> None:
+    skeleton = chain(12)
+    drawn = normalised_adjacency(skeleton, "random").numpy() > 0
+    assert drawn.sum() == skeleton.sum()
+    assert (drawn == drawn.T).all()
+    assert drawn.diagonal().all()
+    assert (drawn != skeleton).sum() > skeleton.sum() / 2
+    assert (drawn == (normalised_adjacency(skeleton, "random").numpy() > 0)).all()
+
+
+def small_hrnet(keypoints: int, stride: int = 4) -> HRNet:
+    config = HRNetConfig(width=3, stem_width=4, bottlenecks=1, modules=(1, 2, 1), blocks=1)
+    return HRNet(config, keypoints, stride=stride)
+
+
+def small_resunet(keypoints: int, stride: int = 4) -> ResUNet:
+    return ResUNet(ResUNetConfig(width=4, blocks=(1, 2, 1, 1)), keypoints, stride=stride)
+
+
+@pytest.mark.parametrize("make", [small_hrnet, small_resunet])
+@pytest.mark.parametrize("stride", [4, 8])
+def test_the_baselines_at_any_size_and_number_of_keypoints(make: Callable[[int, int], HRNet], stride: int) -> None:
+    torch.manual_seed(0)
+    for count, size in ((4, 128), (13, 192)):
+        network = make(count, stride)
+        assert network(torch.rand(2, 3, size, size)).shape == (2, count, size // stride, size // stride)
+    network.eval()
+    images = torch.rand(3, 3, 64, 64)
+    torch.testing.assert_close(network(images)[1:2], network(images[1:2]), atol=1e-5, rtol=1e-4)
+    network.train()
+    (network.branches(images).fused - 1).square().sum().backward()
+    assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    with pytest.raises(GknetError, match="stride"):
+        make(4, 16)
+
+
+def multiply_accumulates(network: torch.nn.Module) -> float:
+    counter = FlopCounterMode(display=False)
+    with counter:
+        network.eval()(torch.rand(1, 3, 256, 256))
+    return counter.get_total_flops() / 2
+
+
+def test_the_small_networks_cost_the_same_to_run() -> None:
+    ours = multiply_accumulates(gknet_s(chain(16)))
+    for other in (hrnet_s(16), resunet_s(16)):
+        assert abs(multiply_accumulates(other) / ours - 1) < 0.05
 
 
 def test_named_sizes() -> None:
     assert 2e6 < parameters(gknet_s(chain(16))) < 3.5e6
     assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
+    assert 28e6 < parameters(hrnet(16)) < 30e6
+    assert 23e6 < parameters(resunet(16)) < 26e6
     assert 0.5e6 < parameters(locator()) < 0.8e6
 
 
@@ -158,6 +222,13 @@ def test_bad_choices_are_named() -> None:
     with pytest.raises(GknetError, match="unknown key 'widht'"):
         configured(GKNetConfig, {"widht": 3})
     assert configured(GKNetConfig, {"width": 16}).width == 16
+    for sizes in ({"width": 0}, {"modules": (1, 0, 3)}):
+        with pytest.raises(GknetError, match="hrnet"):
+            configured(HRNetConfig, sizes)
+    with pytest.raises(GknetError, match="resunet"):
+        ResUNetConfig(blocks=(0, 1, 1, 1))
+    with pytest.raises(GknetError, match="loss"):
+        build("gknet-s", chain(5), loss="hinge")
     with pytest.raises(GknetError, match="graph"):
         GKNetConfig(graph="full")
     with pytest.raises(GknetError, match="network"):

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gknet.decode import SPREAD_CELLS, decode_heatmaps, decode_locator  # noqa: E402
-from gknet.network.backbone import SHARPNESS, SIGMA_CELLS  # noqa: E402
+from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS  # noqa: E402
 from gknet.training.loss import (  # noqa: E402
     box_iou,
     gaussian_targets,

@@ -12,8 +12,13 @@ def train(
     data: Annotated[Path, typer.Argument(help="Dataset in the SKD layout, with the splits train and val.")],
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
     spacecraft: Annotated[str, typer.Option(help="Which spacecraft of the dataset.")],
-    network: Annotated[str, typer.Option(help="gknet-s, gknet-paper or locator.")] = "gknet-s",
-    graph: Annotated[str, typer.Option(help="skeleton, identity (no edges) or none (no graph branch).")] = "skeleton",
+    network: Annotated[
+        str, typer.Option(help="gknet-s, hrnet-s, resunet-s, gknet-paper, hrnet, resunet or locator.")
+    ] = "gknet-s",
+    graph: Annotated[
+        str, typer.Option(help="skeleton, identity (no edges), random (as many) or none (no graph branch).")
+    ] = "skeleton",
+    loss: Annotated[str | None, typer.Option(help="likelihood or squared [the network's own].")] = None,
     minutes: Annotated[float | None, typer.Option(help="Budget by the clock.")] = None,
     epochs: Annotated[float | None, typer.Option(help="Budget by passes over the data.")] = None,
     stages: Annotated[
@@ -51,7 +56,7 @@ def train(
         "stages": None if stages is None else parse_stages(stages),
     }
     given = {name: value for name, value in chosen.items() if value is not None}
-    settings = TrainSettings(network=network, graph=graph, minutes=minutes, epochs=epochs, **given)  # type: ignore[arg-type]
+    settings = TrainSettings(network=network, graph=graph, loss=loss, minutes=minutes, epochs=epochs, **given)  # type: ignore[arg-type]
     if batch is not None:
         settings = replace(settings, stages=tuple(replace(stage, batch=batch) for stage in settings.input_stages))
     state = run(data, spacecraft, out, settings, resume, cache, val)

@@ -9,17 +9,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gknet.errors import GknetError
+
 MEAN, SPREAD = 0.25, 0.25
 """Centre and spread of the pixel values (0 to 1): space is dark, so both are low."""
 
-SIGMA_CELLS = 1.5
-"""Standard deviation of the target Gaussians, in heatmap cells."""
-
-SHARPNESS = 10.0
-"""From maps, which rise by about 1 at a keypoint, to logits: e^10 outweighs the cells of a 64x64 map."""
+COARSEST = 32
+"""The encoders' last stride: an input side is a multiple of it."""
 
 FREQUENCIES = (0.5, 1.0, 2.0, 4.0)
 POSITION_WIDTH = 4 * len(FREQUENCIES)
+
+
+def check_input(image: Tensor) -> None:
+    if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % COARSEST or image.shape[3] % COARSEST:
+        raise GknetError(
+            f"network input: expected (b, 3, h, w) with h and w multiples of {COARSEST}, got {tuple(image.shape)}"
+        )
 
 
 def normalised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -40,19 +46,6 @@ def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c hei
     wide = along_x[:, None, :].expand(-1, height, -1)
     tall = along_y[:, :, None].expand(-1, -1, width)
     return torch.cat([wide, tall])
-
-
-def log_belief(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
-    """Logarithm of the probability that a keypoint lies in a cell."""
-    return (SHARPNESS * maps.float()).flatten(2).log_softmax(dim=2)
-
-
-def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"]:
-    """The belief times 2 pi sigma^2: the target Gaussian of peak 1, averaged over where the keypoint may be.
-
-    That average is what a training by squared error tends to as well, so both are decoded alike.
-    """
-    return (2 * math.pi * SIGMA_CELLS**2 * log_belief(maps).exp()).reshape(maps.shape)
 
 
 class ConvNorm(nn.Module):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,13 +17,11 @@ from gknet.network.backbone import (
     ConvNorm,
     Encoder,
     Pyramid,
-    expected_heatmaps,
+    check_input,
     position_code,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
-
-COARSEST = 32
-"""The encoder's last stride: an input side is a multiple of it."""
+from gknet.network.heatmap import Branches, HeatmapNetwork
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class GKNetConfig:
     node_width     channels of a graph node and of the image cells that it attends to
     node_layers    layers of the graph decoder
     heads          attention heads
-    graph          "skeleton", "identity" (no edges, equal size) or "none" (no graph branch)
+    graph          "skeleton", "identity" (no edges), "random" (as many edges, anywhere) or "none" (no graph branch)
     """
 
     width: int = 32
@@ -55,33 +52,11 @@ class GKNetConfig:
             raise GknetError(f"node_width: expected a multiple of heads ({self.heads}), got {self.node_width}")
 
 
-class Branches(NamedTuple):
-    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch."""
+class GKNet(HeatmapNetwork):
+    """Image -> one heatmap per keypoint at a quarter of the input's resolution."""
 
-    fused: Tensor
-    pixels: Tensor
-    nodes: Tensor | None
-
-
-def check_input(image: Tensor) -> None:
-    if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % COARSEST or image.shape[3] % COARSEST:
-        raise GknetError(
-            f"network input: expected (b, 3, h, w) with h and w multiples of {COARSEST}, got {tuple(image.shape)}"
-        )
-
-
-class GKNet(nn.Module):
-    """Image -> one heatmap per keypoint, peak near 1, at a quarter of the input's resolution.
-
-    Its maps are logits of where the keypoint is (decision 0007); `forward` turns them into heatmaps.
-    """
-
-    likelihood = True
-    stride = 4
-    input_size = 256
-
-    def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"]) -> None:
-        super().__init__()
+    def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"], loss: str = "likelihood") -> None:
+        super().__init__(loss, stride=4)
         self.config = config
         keypoints = len(adjacency)
         self.encoder = Encoder(config.width)
@@ -109,12 +84,7 @@ class GKNet(nn.Module):
         nn.init.zeros_(self.node_filter.bias)
         self.fusion = Fusion(len(adjacency))
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h4 w4"]:
-        """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
-        return expected_heatmaps(self.branches(image).fused)
-
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
-        """The maps and what each branch contributed, for a loss on both."""
         check_input(image)
         features = self.encoder(image)
         coarse = features[3]

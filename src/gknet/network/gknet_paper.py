@@ -15,9 +15,9 @@ from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gknet.network.backbone import POSITION_WIDTH, ConvNorm, normalised, position_code
-from gknet.network.gknet import Branches, check_input
+from gknet.network.backbone import POSITION_WIDTH, ConvNorm, check_input, normalised, position_code
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
+from gknet.network.heatmap import Branches, HeatmapNetwork
 
 
 @dataclass(frozen=True)
@@ -39,15 +39,11 @@ def _level(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(ConvNorm(inputs, outputs), ConvNorm(outputs, outputs))
 
 
-class GKNetPaper(nn.Module):
+class GKNetPaper(HeatmapNetwork):
     """Image -> one heatmap per keypoint at an eighth of the input's resolution: 256 -> 32."""
 
-    likelihood = False
-    stride = 8
-    input_size = 256
-
-    def __init__(self, config: GKNetPaperConfig, adjacency: Bool[ndarray, "n n"]) -> None:
-        super().__init__()
+    def __init__(self, config: GKNetPaperConfig, adjacency: Bool[ndarray, "n n"], loss: str = "squared") -> None:
+        super().__init__(loss, stride=8)
         self.config = config
         keypoints = len(adjacency)
         widths = [config.base * factor for factor in (1, 2, 4, 8, 16, 16)]
@@ -68,10 +64,6 @@ class GKNetPaper(nn.Module):
             self.node_map = nn.Linear(width, self.map_side**2)
             nn.init.normal_(self.node_map.weight, std=1e-4)
             self.fusion = Fusion(keypoints)
-
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n h8 w8"]:
-        """RGB in 0 to 1 -> heatmaps; channel k is keypoint k."""
-        return self.branches(image).fused
 
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
         check_input(image)

@@ -14,7 +14,7 @@ from torch.nn import functional
 from gknet.errors import GknetError
 from gknet.network.backbone import Attention
 
-Graph = Literal["skeleton", "identity", "none"]
+Graph = Literal["skeleton", "identity", "random", "none"]
 
 
 def checked_graph(graph: str) -> Graph:
@@ -26,7 +26,8 @@ def checked_graph(graph: str) -> Graph:
 def normalised_adjacency(adjacency: Bool[ndarray, "n n"], graph: Graph = "skeleton") -> Float[Tensor, "n n"]:
     """D^-1/2 A D^-1/2 of the binary, symmetric A with ones on its diagonal (eq. 3).
 
-    `identity` forgets the edges: nodes keep their layers and do not mix, which is the ablation at equal size.
+    The ablations at equal size: `identity` forgets the edges, so nodes keep their layers and do not mix; `random` has
+    as many edges as the skeleton, between pairs drawn once and for all.
     """
     matrix = np.asarray(adjacency, dtype=np.float64)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
@@ -35,8 +36,19 @@ def normalised_adjacency(adjacency: Bool[ndarray, "n n"], graph: Graph = "skelet
         raise GknetError("adjacency: expected zeros and ones, symmetric, with ones on the diagonal")
     if graph == "identity":
         matrix = np.eye(len(matrix))
+    elif graph == "random":
+        matrix = _random_adjacency(len(matrix), int(np.triu(matrix, 1).sum()))
     root = 1 / np.sqrt(matrix.sum(axis=1))
     return torch.from_numpy(root[:, None] * matrix * root[None, :]).float()
+
+
+def _random_adjacency(count: int, edges: int) -> Float[ndarray, "n n"]:
+    """A function of its arguments alone, since a trained network's graph is rebuilt, not stored."""
+    pairs = np.argwhere(np.triu(np.ones((count, count)), 1))
+    chosen = pairs[np.random.default_rng((count, edges)).permutation(len(pairs))[:edges]]
+    matrix = np.eye(count)
+    matrix[chosen[:, 0], chosen[:, 1]] = matrix[chosen[:, 1], chosen[:, 0]] = 1
+    return matrix
 
 
 class GraphConvolution(nn.Module):

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.errors import GknetError
-from gknet.network.backbone import Encoder, Pyramid
-from gknet.network.gknet import check_input
+from gknet.network.backbone import Encoder, Pyramid, check_input
 
 
 @dataclass(frozen=True)

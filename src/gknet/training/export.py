@@ -154,6 +154,7 @@ def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:
         "version": run.version,
         "network": run.network,
         "graph": run.graph,
+        "loss": run.loss,
         "spacecraft": run.spacecraft_toml,
         "stride": network.stride,
         "input_size": run.input_size,
@@ -171,7 +172,7 @@ def export_run(folder: Path, out: Path, tolerance: float = TOLERANCE) -> Exporte
     """
     run = load_run(folder)
     spacecraft = spacecraft_from_toml(run.spacecraft_toml, str(folder / "run.json"))
-    network = build(run.network, spacecraft.adjacency, run.graph)
+    network = build(run.network, spacecraft.adjacency, run.graph, run.loss)
     weights = load_weights(folder / BEST)
     try:
         network.load_state_dict(weights)

@@ -71,7 +71,7 @@ def train(
     with fabric.rank_zero_first():
         cache = open_cache(training_data, settings, cache_folder or data / "cache", fabric.print)
 
-    network = build(settings.network, spacecraft.adjacency, settings.graph)
+    network = build(settings.network, spacecraft.adjacency, settings.graph, settings.chosen_loss)
     if settings.init is not None and not resume:
         taken, total = warm_start(network, settings.init)
         fabric.print(f"{settings.init}: {taken} of {total} tensors taken")
@@ -88,6 +88,7 @@ def train(
     run = Run(
         settings.network,
         settings.graph,
+        settings.chosen_loss,
         settings.input_size,
         toml,
         asdict(settings),
@@ -117,7 +118,9 @@ def train(
         if state.best is None or found.score < state.best["score"]:
             state.best = {"score": found.score, "samples": state.samples, **found.values}
             run = replace(run, best=state.best)
-            save_weights(out / BEST, average.state_dict(), {"network": run.network, "graph": run.graph})
+            save_weights(
+                out / BEST, average.state_dict(), {"network": run.network, "graph": run.graph, "loss": run.loss}
+            )
         return {f"val_{name}": value for name, value in found.values.items()}
 
     with Teller(out, state.history, quiet or not fabric.is_global_zero) as teller, closing(batches):

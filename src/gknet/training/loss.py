@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from gknet.network.backbone import log_belief
+from gknet.network.heatmap import log_belief
 
 TINY = 1e-12
 

@@ -8,14 +8,18 @@ from pathlib import Path
 
 from gknet.atomic import write_text
 from gknet.errors import GknetError
-from gknet.network.build import NETWORKS
+from gknet.network.build import NETWORKS, default_loss
 from gknet.network.graph import checked_graph
+from gknet.network.heatmap import checked_loss
 from gknet.training.cache import Window
 from gknet.training.schedule import Stage
 
+PAPER_STAGES = (Stage(1.0, 256, 16),)
 STAGES = {
     "gknet-s": (Stage(0.4, 128, 32), Stage(0.3, 192, 32), Stage(0.3, 256, 32)),
-    "gknet-paper": (Stage(1.0, 256, 16),),
+    "gknet-paper": PAPER_STAGES,
+    "hrnet": PAPER_STAGES,
+    "resunet": PAPER_STAGES,
     "locator": (Stage(0.4, 128, 32), Stage(0.6, 256, 32)),
 }
 """Small pictures first: most of what there is to learn is seen there, at a quarter of the cost."""
@@ -25,6 +29,7 @@ STAGES = {
 class TrainSettings:
     """One training run.
 
+    loss              "likelihood" or "squared"; None takes the network's own
     minutes, epochs   the budget: exactly one of them
     stages            None takes the network's own (STAGES)
     warm_up           share of the budget in which the learning rate rises
@@ -39,6 +44,7 @@ class TrainSettings:
 
     network: str = "gknet-s"
     graph: str = "skeleton"
+    loss: str | None = None
     minutes: float | None = None
     epochs: float | None = None
     stages: tuple[Stage, ...] | None = None
@@ -62,6 +68,8 @@ class TrainSettings:
         if self.network not in NETWORKS:
             raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{self.network}'")
         checked_graph(self.graph)
+        if self.loss is not None:
+            checked_loss(self.loss)
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
         for name in ("learning_rate", "clip", "devices", "val_frames", "validations", "cache_size"):
@@ -71,8 +79,12 @@ class TrainSettings:
             raise GknetError(f"ema and warm_up: expected values in [0, 1), got {self.ema} and {self.warm_up}")
 
     @property
+    def chosen_loss(self) -> str:
+        return default_loss(self.network) if self.loss is None else self.loss
+
+    @property
     def input_stages(self) -> tuple[Stage, ...]:
-        return self.stages or STAGES[self.network]
+        return self.stages or STAGES.get(self.network, STAGES["gknet-s"])
 
     @property
     def input_size(self) -> int:
@@ -96,6 +108,7 @@ class Run:
 
     network: str
     graph: str
+    loss: str
     input_size: int
     spacecraft_toml: str
     settings: dict[str, object]

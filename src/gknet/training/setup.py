@@ -62,7 +62,7 @@ def make_fabric(settings: TrainSettings) -> Fabric:
 def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings) -> Task:
     if isinstance(network, Locator):
         return LocatorTask(spacecraft, network.stride, settings.input_size)
-    return KeypointTask(spacecraft, network.stride, settings.input_size, settings.auxiliary, network.likelihood)
+    return KeypointTask(spacecraft, settings.input_size, settings.auxiliary)
 
 
 def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:

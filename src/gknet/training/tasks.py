@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gknet.frame import Frame
-from gknet.network.backbone import SIGMA_CELLS
-from gknet.network.gknet import Branches
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
 from gknet.training.loss import gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
 from gknet.training.validation import Validation, validate_keypoints, validate_locator
+
+LOSSES = {"likelihood": likelihood_loss, "squared": heatmap_loss}
 
 
 @runtime_checkable
@@ -32,24 +33,20 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class KeypointTask:
-    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss.
-
-    likelihood  the maps are logits of the cell, not heatmaps
-    """
+    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss."""
 
     spacecraft: Spacecraft
-    stride: int
     input_size: int
     auxiliary: float
-    likelihood: bool
     draw: Draw = draw_keypoints
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
-        branches: Branches = network.branches(batch.network_input(device))  # type: ignore[operator]
+        keypoint_network = cast(HeatmapNetwork, network)
+        measure = LOSSES[keypoint_network.loss]
+        branches = keypoint_network.branches(batch.network_input(device))
         height, width = branches.fused.shape[2:]
         points, weight = batch.points_px.to(device), batch.weight.to(device)
-        targets = gaussian_targets(points, self.stride, height, width, SIGMA_CELLS)
-        measure = likelihood_loss if self.likelihood else heatmap_loss
+        targets = gaussian_targets(points, keypoint_network.stride, height, width, SIGMA_CELLS)
         loss = measure(branches.fused, targets, weight)
         if self.auxiliary > 0 and branches.nodes is not None:
             parts = measure(branches.pixels, targets, weight) + measure(branches.nodes, targets, weight)

@@ -1,0 +1,70 @@
+"""What every keypoint network answers with: maps that a loss sees, and the heatmaps that are decoded from them."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple, get_args
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gknet.errors import GknetError
+
+SIGMA_CELLS = 1.5
+"""Standard deviation of the target Gaussians, in heatmap cells."""
+
+SHARPNESS = 10.0
+"""From maps, which rise by about 1 at a keypoint, to logits: e^10 outweighs the cells of a 64x64 map."""
+
+Loss = Literal["likelihood", "squared"]
+
+
+def checked_loss(loss: str) -> Loss:
+    if loss not in get_args(Loss):
+        raise GknetError(f"loss: expected one of {', '.join(get_args(Loss))}, got '{loss}'")
+    return loss  # type: ignore[return-value]
+
+
+def log_belief(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
+    """Logarithm of the probability that a keypoint lies in a cell."""
+    return (SHARPNESS * maps.float()).flatten(2).log_softmax(dim=2)
+
+
+def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"]:
+    """The belief times 2 pi sigma^2: the target Gaussian of peak 1, averaged over where the keypoint may be.
+
+    That average is what a training by squared error tends to as well, so both are decoded alike.
+    """
+    return (2 * math.pi * SIGMA_CELLS**2 * log_belief(maps).exp()).reshape(maps.shape)
+
+
+class Branches(NamedTuple):
+    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch."""
+
+    fused: Tensor
+    pixels: Tensor
+    nodes: Tensor | None
+
+
+class HeatmapNetwork(nn.Module):
+    """Image -> one heatmap per keypoint, peak near 1; channel k is keypoint k.
+
+    loss    "likelihood": the maps are logits of where the keypoint is (decision 0007); "squared": they are heatmaps
+    stride  input pixels per cell
+    """
+
+    stride: int
+    input_size = 256
+
+    def __init__(self, loss: str, stride: int) -> None:
+        super().__init__()
+        self.loss, self.stride = checked_loss(loss), stride
+
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+        """The maps and what each branch contributed, for a loss on all of them."""
+        raise NotImplementedError
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n hs ws"]:
+        """RGB in 0 to 1 -> heatmaps."""
+        fused = self.branches(image).fused
+        return expected_heatmaps(fused) if self.loss == "likelihood" else fused
