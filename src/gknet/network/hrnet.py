@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import cast
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
