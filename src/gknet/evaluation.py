@@ -9,18 +9,22 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.estimator import Estimator
-from gknet.frame import Estimate, Frame
+from gknet.frame import Estimate, Frame, Keypoints
 from gknet.metrics import FrameErrors, Summary, errors, keypoint_errors_px, oracle_crop, summarise
 from gknet.source import Unreadable
 from gknet.spacecraft import Spacecraft
 
 Protocol = Literal["oracle", "detected"]
+SWAP_PX = 10.0
+"""A detection within this of another keypoint, and not of its own, is a swap."""
+
 PROTOCOL_WORDS: dict[Protocol, str] = {"oracle": "oracle crop", "detected": "detected crop"}
 
 
@@ -29,6 +33,7 @@ class Case:
     """One frame's answer. `index` is its place in the dataset.
 
     keypoint_px  (n,) distances in pixels of the 256 oracle crop, NaN for keypoints out of view
+    taken_for    (n,) the true keypoint at which each detection lies (`taken_for`)
     seen         (n,) bool: in view and not hidden; None when unknown
     """
 
@@ -37,6 +42,7 @@ class Case:
     estimate: Estimate
     errors: FrameErrors
     keypoint_px: Float[ndarray, "n"]
+    taken_for: Int[ndarray, "n"]
     seen: Bool[ndarray, "n"] | None
     seconds: float
 
@@ -162,4 +168,31 @@ def _case(index: int, frame: Frame, sequence: str, estimator: Estimator, protoco
     in_view = frame.camera.contains(true_px)
     distance = np.where(in_view, keypoint_errors_px(estimate.keypoints, true_px, crop), np.nan)
     found = errors(frame, estimate, spacecraft, crop, sequence)
-    return Case(index, frame.name, estimate, found, distance, frame.visible, seconds)
+    taken = taken_for(estimate.keypoints, true_px, in_view, crop)
+    return Case(index, frame.name, estimate, found, distance, taken, frame.visible, seconds)
+
+
+def taken_for(
+    keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], in_view: Bool[ndarray, "n"], crop: Crop
+) -> Int[ndarray, "n"]:
+    """For each keypoint in view, the true keypoint that its detection lies at; -1 for none, and out of view.
+
+    Within SWAP_PX of its own (pixels of the 256 oracle crop) it is itself; else the nearest other one within SWAP_PX.
+    """
+    count = len(true_px)
+    if keypoints is None:
+        return np.full(count, -1)
+    distance = np.linalg.norm(keypoints.pixels[:, None] - true_px[None], axis=2) * crop.scale
+    distance[:, ~in_view] = np.inf
+    own = np.arange(count)
+    taken = np.where(np.diag(distance) < SWAP_PX, own, distance.argmin(axis=1))
+    return np.where(in_view & (distance[own, taken] < SWAP_PX), taken, -1)
+
+
+def confusion(run: Run) -> Int[ndarray, "n n"]:
+    """How often keypoint i (row) in view was detected at keypoint j: the diagonal is right, the rest are swaps."""
+    taken = np.stack([case.taken_for for case in run.cases])
+    matrix = np.zeros((taken.shape[1], taken.shape[1]), dtype=np.int64)
+    for row, column in enumerate(taken.T):
+        matrix[row] = np.bincount(column[column >= 0], minlength=len(matrix))
+    return matrix

@@ -1,0 +1,158 @@
+"""Methods against each other on the same frames: means and paired differences with their intervals.
+
+A `Trial` is one trained network judged on the test frames. Intervals are bootstrapped over sequences, the frames of
+which are alike, and over seeds, which are few: both are drawn with replacement, the same draw for both methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from gknet.errors import GknetError
+from gknet.evaluation import Run, confusion
+
+METRICS = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One network's errors on the test frames.
+
+    sequences  (m,) the sequence of each frame
+    values     metric -> (m,), NaN where the frame cannot say
+    confusion  (n, n) how often keypoint i was detected at keypoint j
+    """
+
+    method: str
+    spacecraft: str
+    seed: int
+    frames: tuple[str, ...]
+    sequences: tuple[str, ...]
+    values: Mapping[str, Float[ndarray, "m"]]
+    confusion: Int[ndarray, "n n"]
+
+    @staticmethod
+    def of(run: Run, method: str, spacecraft: str, seed: int) -> Trial:
+        found = [case.errors for case in run.cases]
+        values = {
+            metric: np.array([np.nan if (v := getattr(e, metric)) is None else v for e in found], dtype=np.float64)
+            for metric in METRICS
+        }
+        sequences = tuple(e.sequence for e in found)
+        frames = tuple(e.name for e in found)
+        return Trial(method, spacecraft, seed, frames, sequences, values, confusion(run))
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON: four digits, null where the frame cannot say."""
+        values = {
+            name: [None if np.isnan(v) else float(f"{v:.4g}") for v in column] for name, column in self.values.items()
+        }
+        return {
+            "method": self.method,
+            "spacecraft": self.spacecraft,
+            "seed": self.seed,
+            "frames": list(self.frames),
+            "sequences": list(self.sequences),
+            "values": values,
+            "confusion": self.confusion.tolist(),
+        }
+
+    @staticmethod
+    def from_dict(content: Mapping[str, object]) -> Trial:
+        try:
+            values = {
+                str(name): np.array([np.nan if v is None else v for v in column], dtype=np.float64)
+                for name, column in content["values"].items()  # type: ignore[attr-defined]
+            }
+            return Trial(
+                str(content["method"]),
+                str(content["spacecraft"]),
+                int(content["seed"]),  # type: ignore[call-overload]
+                tuple(content["frames"]),  # type: ignore[arg-type]
+                tuple(content["sequences"]),  # type: ignore[arg-type]
+                values,
+                np.array(content["confusion"], dtype=np.int64),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise GknetError(f"trial: expected the content that a trial writes ({error!r})") from error
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean, or a difference of means, with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def excludes_zero(self) -> bool:
+        return self.low > 0 or self.high < 0
+
+
+def mean_of(trials: Sequence[Trial], metric: str, seed: int = 0, resamples: int = 2000) -> Interval:
+    """The mean over frames and seeds of one method on one spacecraft."""
+    table, counts = _by_sequence(trials, metric)
+    means = _resampled(table, counts, *_draws(len(trials), counts.shape[1], seed, resamples))
+    return Interval(float(table.sum() / counts.sum()), *_ends(means))
+
+
+def difference(
+    first: Sequence[Trial], second: Sequence[Trial], metric: str, seed: int = 0, resamples: int = 2000
+) -> Interval:
+    """Mean of the first method less that of the second, on the same frames; negative where the first is better.
+
+    With as many seeds on both sides they are drawn as pairs.
+    """
+    if first[0].frames != second[0].frames:
+        raise GknetError(f"comparison: {first[0].method} and {second[0].method} were judged on different frames")
+    tables = [_by_sequence(trials, metric) for trials in (first, second)]
+    draws = _draws(len(first), tables[0][1].shape[1], seed, resamples)
+    seeds = draws[1] if len(second) == len(first) else _draws(len(second), 1, seed + 1, resamples)[1]
+    gap = _resampled(*tables[0], *draws) - _resampled(*tables[1], draws[0], seeds)
+    means = [table.sum() / counts.sum() for table, counts in tables]
+    return Interval(float(means[0] - means[1]), *_ends(gap))
+
+
+def _by_sequence(
+    trials: Sequence[Trial], metric: str
+) -> tuple[Float[ndarray, "seeds sequences"], Float[ndarray, "seeds sequences"]]:
+    """Sums and numbers of the known values of each sequence."""
+    if not trials:
+        raise GknetError("comparison: expected at least one trial, got none")
+    if any(trial.frames != trials[0].frames for trial in trials):
+        raise GknetError(f"comparison: the trials of {trials[0].method} were judged on different frames")
+    names = sorted(set(trials[0].sequences))
+    place = np.array([names.index(sequence) for sequence in trials[0].sequences])
+    sums, counts = np.zeros((len(trials), len(names))), np.zeros((len(trials), len(names)))
+    for row, trial in enumerate(trials):
+        known = ~np.isnan(trial.values[metric])
+        sums[row] = np.bincount(place[known], weights=trial.values[metric][known], minlength=len(names))
+        counts[row] = np.bincount(place[known], minlength=len(names))
+    if counts.sum() == 0:
+        raise GknetError(f"comparison: no frame of {trials[0].method} has the metric {metric}")
+    return sums, counts
+
+
+def _draws(seeds: int, sequences: int, seed: int, resamples: int) -> tuple[ndarray, ndarray]:
+    """How often each resample holds each sequence (r, sequences), and each seed (r, seeds)."""
+    rng = np.random.default_rng(seed)
+    return (
+        rng.multinomial(sequences, np.full(sequences, 1 / sequences), size=resamples),
+        rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples),
+    )
+
+
+def _resampled(sums: ndarray, counts: ndarray, sequences: ndarray, seeds: ndarray) -> Float[ndarray, "r"]:
+    top = np.einsum("rk,ks,rs->r", seeds, sums, sequences)
+    return top / np.maximum(np.einsum("rk,ks,rs->r", seeds, counts, sequences), 1e-9)
+
+
+def _ends(values: Float[ndarray, "r"]) -> tuple[float, float]:
+    low, high = np.percentile(values, (2.5, 97.5))
+    return float(low), float(high)

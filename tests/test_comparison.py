@@ -1,0 +1,75 @@
+"""Intervals that know which frames are alike, and differences that know which frames are the same."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from gknet.comparison import Trial, difference, mean_of
+from gknet.errors import GknetError
+
+
+def trial(method: str, values: np.ndarray, seed: int = 0, per_sequence: int = 10) -> Trial:
+    frames = tuple(f"{k:04d}" for k in range(len(values)))
+    sequences = tuple(f"s{k // per_sequence}" for k in range(len(values)))
+    return Trial(method, "toy", seed, frames, sequences, {"rmse_px": values}, np.eye(3, dtype=np.int64))
+
+
+def test_the_mean_is_over_known_frames_and_its_interval_holds_it() -> None:
+    values = np.arange(40.0)
+    values[3] = np.nan
+    found = mean_of([trial("a", values)], "rmse_px")
+    assert found.mean == pytest.approx(np.nanmean(values))
+    assert found.low < found.mean < found.high
+
+
+def test_frames_of_one_sequence_do_not_count_as_many() -> None:
+    rng = np.random.default_rng(0)
+    alike = np.repeat(rng.normal(size=8), 50) + 0.01 * rng.normal(size=400)
+    together = mean_of([trial("a", alike, per_sequence=50)], "rmse_px")
+    apart = mean_of([trial("a", alike, per_sequence=1)], "rmse_px")
+    assert together.high - together.low > 4 * (apart.high - apart.low)
+
+
+def test_a_difference_is_paired() -> None:
+    rng = np.random.default_rng(1)
+    base = rng.normal(20, 10, 200)
+    worse = base + rng.normal(1, 0.5, 200)
+    gap = difference([trial("a", base)], [trial("b", worse)], "rmse_px")
+    assert gap.mean == pytest.approx((base - worse).mean())
+    assert gap.excludes_zero
+    assert gap.high < 0
+    alone = mean_of([trial("a", base)], "rmse_px")
+    assert gap.high - gap.low < (alone.high - alone.low) / 3
+    assert not difference([trial("a", base)], [trial("b", rng.permutation(base))], "rmse_px").excludes_zero
+
+
+def test_seeds_that_disagree_widen_the_interval() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(20, 1, 100)
+    agreeing = mean_of([trial("a", values, seed) for seed in range(3)], "rmse_px")
+    disagreeing = mean_of([trial("a", values + 5 * seed, seed) for seed in range(3)], "rmse_px")
+    assert disagreeing.high - disagreeing.low > 3 * (agreeing.high - agreeing.low)
+
+
+def test_different_frames_are_not_compared() -> None:
+    values = np.arange(20.0)
+    with pytest.raises(GknetError, match="different frames"):
+        difference([trial("a", values)], [trial("b", values[:10])], "rmse_px")
+    with pytest.raises(GknetError, match="at least one"):
+        mean_of([], "rmse_px")
+    with pytest.raises(GknetError, match="no frame"):
+        mean_of([trial("a", np.full(20, np.nan))], "rmse_px")
+
+
+def test_a_trial_survives_json() -> None:
+    values = np.array([1.23456, np.nan, 3.0])
+    first = trial("a", values)
+    again = Trial.from_dict(json.loads(json.dumps(first.to_dict())))
+    np.testing.assert_allclose(again.values["rmse_px"], values, rtol=1e-3)
+    assert again.sequences == first.sequences
+    assert (again.confusion == first.confusion).all()
+    with pytest.raises(GknetError, match="trial"):
+        Trial.from_dict({"method": "a"})
