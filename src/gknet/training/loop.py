@@ -130,7 +130,7 @@ def train(
         try:
             while progress < 1:
                 batch = next(batches)
-                rate = learning_rate(settings.learning_rate, progress, settings.warm_up)
+                rate = learning_rate(settings.learning_rate, progress, settings.warm_up, settings.cycles)
                 for group in optimizer.param_groups:
                     group["lr"] = rate
                 model.train()

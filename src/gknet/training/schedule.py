@@ -49,11 +49,17 @@ def stage_at(stages: tuple[Stage, ...], progress: float) -> Stage:
     return stages[-1]
 
 
-def learning_rate(peak: float, progress: float, warm_up: float) -> float:
-    """Linear up to `peak` during the share `warm_up`, then half a cosine down to zero at the end."""
+def learning_rate(peak: float, progress: float, warm_up: float, cycles: int = 1) -> float:
+    """Linear up to `peak` during the share `warm_up`, then half a cosine down to zero, `cycles` times over.
+
+    More than one cycle are the warm restarts of the paper's training (80 epochs, one every 16).
+    """
     if progress < warm_up:
         return peak * max(progress / warm_up, 0.01)
-    return peak * 0.5 * (1 + math.cos(math.pi * min(1.0, (progress - warm_up) / (1 - warm_up))))
+    along = min(1.0, (progress - warm_up) / (1 - warm_up))
+    if along < 1:
+        along = cycles * along % 1
+    return peak * 0.5 * (1 + math.cos(math.pi * along))
 
 
 @dataclass(frozen=True)

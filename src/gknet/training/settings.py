@@ -33,6 +33,7 @@ class TrainSettings:
     minutes, epochs   the budget: exactly one of them
     stages            None takes the network's own (STAGES)
     warm_up           share of the budget in which the learning rate rises
+    cycles            of the cosine; more than one are warm restarts
     ema               how much of the averaged weights stays at each step
     auxiliary         weight of the loss on each branch's own maps
     clip              largest norm of the gradient
@@ -51,6 +52,7 @@ class TrainSettings:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
     warm_up: float = 0.03
+    cycles: int = 1
     auxiliary: float = 0.2
     ema: float = 0.997
     clip: float = 5.0
@@ -72,7 +74,7 @@ class TrainSettings:
             checked_loss(self.loss)
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
-        for name in ("learning_rate", "clip", "devices", "val_frames", "validations", "cache_size"):
+        for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):
             if getattr(self, name) <= 0:
                 raise GknetError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if not 0 <= self.ema < 1 or not 0 <= self.warm_up < 1:

@@ -1,0 +1,206 @@
+"""Tables 1 to 3 of the paper, the graph's ablation and the swaps, from what recipes/paper_tables.py left.
+
+    python recipes/paper_report.py --scale cpu --results results/paper_tables
+
+Hardware   any
+Time       seconds
+Expected   RESULTS/SCALE/README.md; it says what is missing when trainings are
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from gknet.atomic import write_text
+from gknet.comparison import Interval, Trial, difference, mean_of
+from gknet.errors import GknetError
+from gknet.fleet import NAMES
+
+PAPER_RMSE = {
+    "HRNet": (6.12, 74.69, 32.64),
+    "ResUNet": (5.62, 59.22, 54.11),
+    "GKNet": (5.38, 29.11, 24.58),
+    "GKNet, no graph branch": (5.92, 37.30, 27.03),
+}
+PAPER_POSE = {
+    "DMANet": ((1.136, 0.997), (2.627, 1.821), (1.405, 2.745)),
+    "HRNet": ((0.754, 0.612), (3.042, 2.157), (1.151, 2.029)),
+    "ResUNet": ((0.725, 0.553), (1.416, 1.995), (1.281, 1.953)),
+    "GKNet": ((0.763, 0.547), (1.163, 1.016), (0.978, 1.485)),
+}
+PROTOCOLS = {
+    "paper": "the paper's read-out (highest cell of 32x32, plain PnP, oracle crop)",
+    "oracle": "ours, oracle crop",
+    "detected": "ours, detected crop",
+}
+ORDER = ("DMANet", "HRNet", "ResUNet", "GKNet")
+GRAPHS = ("GKNet", "GKNet, no edges", "GKNet, random edges", "GKNet, no graph branch")
+
+Trials = dict[tuple[str, str, str], list[Trial]]
+"""(name, spacecraft, protocol) -> one for each seed"""
+
+
+def read(folder: Path) -> tuple[Trials, dict[str, list[dict]]]:
+    """Every training's trials, and what each method cost."""
+    trials: Trials = defaultdict(list)
+    costs: dict[str, list[dict]] = defaultdict(list)
+    for path in sorted(folder.glob("satellite_*.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        for protocol, values in content.pop("protocols").items():
+            trial = Trial.from_dict(values)
+            trials[content["name"], trial.spacecraft, protocol].append(trial)
+        costs[content["name"]].append(content)
+    if not trials:
+        raise GknetError(f"{folder}: no results; run recipes/paper_tables.py first")
+    return trials, costs
+
+
+def shown(interval: Interval) -> str:
+    return f"{interval.mean:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
+
+
+def cell(trials: Trials, name: str, spacecraft: str, protocol: str, metric: str) -> str:
+    found = trials.get((name, spacecraft, protocol))
+    if not found:
+        return "not run"
+    try:
+        return shown(mean_of(found, metric))
+    except GknetError:
+        return "-"
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def rmse_table(trials: Trials, names: tuple[str, ...], protocol: str, metric: str = "rmse_px") -> str:
+    rows = []
+    for name in names:
+        printed = PAPER_RMSE.get(name) if metric == "rmse_px" else None
+        row = [name, *[cell(trials, name, spacecraft, protocol, metric) for spacecraft in NAMES]]
+        rows.append([*row, ", ".join(f"{value:g}" for value in printed) if printed else ""])
+    return markdown(["method", *NAMES, "the paper's, its own spacecraft"], rows)
+
+
+def pose_table(trials: Trials, protocol: str) -> str:
+    rows = []
+    for name in ORDER:
+        both = [
+            f"{cell(trials, name, craft, protocol, 'e_t')}; {cell(trials, name, craft, protocol, 'e_q_rad')}"
+            for craft in NAMES
+        ]
+        rows.append([name, *both, "; ".join(f"{e_t:g}, {e_q:g}" for e_t, e_q in PAPER_POSE[name])])
+    return markdown(["method", *[f"{name}: E_t; E_q rad" for name in NAMES], "the paper's, its own spacecraft"], rows)
+
+
+def difference_table(trials: Trials, others: tuple[str, ...], metrics: tuple[str, ...], protocol: str) -> str:
+    """GKNet less each other, paired by frame; bold where the interval excludes zero."""
+    rows = []
+    for name in others:
+        for metric in metrics:
+            row = []
+            for spacecraft in NAMES:
+                pair = [trials.get((each, spacecraft, protocol)) for each in ("GKNet", name)]
+                if not all(pair):
+                    row.append("not run")
+                    continue
+                seeds = {trial.seed for trial in pair[0]} & {trial.seed for trial in pair[1]}
+                ours, theirs = ([trial for trial in side if trial.seed in seeds] for side in pair)
+                try:
+                    gap = difference(ours, theirs, metric)
+                    part = 100 * gap.mean / mean_of(theirs, metric).mean
+                except GknetError:
+                    row.append("-")
+                    continue
+                words = f"{shown(gap)}, {part:+.0f} %, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+                row.append(f"**{words}**" if gap.excludes_zero else words)
+            rows.append([name, metric, *row])
+    return markdown(["GKNet less", "metric", *NAMES], rows)
+
+
+def cost_table(costs: dict[str, list[dict]]) -> str:
+    rows = []
+    for name, found in costs.items():
+        one = found[0]
+        minutes = [content["minutes"] for content in found]
+        rows.append(
+            [
+                name,
+                f"{one['parameters'] / 1e6:.2f} M",
+                f"{one['gmac']:.2f}",
+                f"{np.median([content['ms'] for content in found]):.1f}",
+                f"{one['learning_rate']:g}",
+                str(one["samples"]),
+                f"{np.mean(minutes):.1f}",
+                str(len(found)),
+            ]
+        )
+    header = ["method", "parameters", "GMAC a crop", "ms a crop", "learning rate", "pictures seen", "minutes"]
+    return markdown([*header, "trainings"], rows)
+
+
+def swap_table(trials: Trials, protocol: str = "oracle") -> str:
+    """Of the detections in view: at their own keypoint, at another one (a swap), at none."""
+    rows = []
+    for name in GRAPHS:
+        row = []
+        for spacecraft in NAMES:
+            found = trials.get((name, spacecraft, protocol))
+            if not found:
+                row.append("not run")
+                continue
+            matrix = sum(trial.confusion for trial in found)
+            right, all_near = np.trace(matrix), matrix.sum()
+            row.append(f"{right} right, {all_near - right} swapped ({100 * (1 - right / max(all_near, 1)):.1f} %)")
+        rows.append([name, *row])
+    return markdown(["graph", *NAMES], rows)
+
+
+def page(trials: Trials, costs: dict[str, list[dict]], scale: str) -> str:
+    parts = [
+        f"# The paper's tables, scale `{scale}`",
+        "Made by `recipes/paper_tables.py` and `recipes/paper_report.py`; the method, the differences from the paper "
+        "and what follows from the figures are in [docs/paper.md](../../../docs/paper.md). Means over the test frames "
+        "and seeds with 95 % intervals, bootstrapped over sequences and seeds; pixels of the 256 crop, radians.",
+        "## Cost\n" + cost_table(costs),
+    ]
+    hybrid = tuple(name for name in ORDER if name != "DMANet")
+    for protocol, words in PROTOCOLS.items():
+        parts.append(f"## Table 1, RMSE in px: {words}\n" + rmse_table(trials, hybrid, protocol))
+    parts.append("## Hidden keypoints, RMSE in px: ours, oracle crop\n")
+    parts[-1] += rmse_table(trials, hybrid, "oracle", "rmse_hidden_px")
+    for protocol, words in PROTOCOLS.items():
+        parts.append(f"## Table 2, pose: {words}\n" + pose_table(trials, protocol))
+    others = tuple(name for name in ORDER if name != "GKNet")
+    parts.append("## GKNet less the others, paired by frame (bold: the interval excludes zero), ours, oracle crop\n")
+    parts[-1] += difference_table(trials, others, ("rmse_px", "e_t", "e_q_rad"), "oracle")
+    parts.append("## Table 3 and beyond: which graph? RMSE in px, ours, oracle crop\n")
+    parts[-1] += rmse_table(trials, GRAPHS, "oracle")
+    parts.append(
+        "## The graph on hidden keypoints, RMSE in px\n" + rmse_table(trials, GRAPHS, "oracle", "rmse_hidden_px")
+    )
+    parts.append("## The skeleton less the other graphs, paired by frame\n")
+    parts[-1] += difference_table(trials, GRAPHS[1:], ("rmse_px", "rmse_hidden_px"), "oracle")
+    parts.append("## Swaps, ours, oracle crop\n" + swap_table(trials))
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
+    parser.add_argument("--scale", default="cpu", help="its sub-folder")
+    arguments = parser.parse_args()
+    folder = arguments.results / arguments.scale
+    text = page(*read(folder), arguments.scale)
+    write_text(folder / "README.md", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

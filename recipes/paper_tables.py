@@ -1,0 +1,302 @@
+"""The paper's comparison, run fairly: GKNet, HRNet, ResUNet and DMANet, and GKNet with other graphs.
+
+    pip install '.[render,train]'
+    python recipes/paper_tables.py --scale cpu --work runs/paper --results results/paper_tables
+    python recipes/paper_report.py --scale cpu --results results/paper_tables
+
+--scale smoke  a few minutes: shows that every stage works, says nothing about the methods
+--scale cpu    2 cores: every method at the forward cost of gknet-s (0.8 GMAC), from scratch, the same crops and as many
+               of them, and the same sweep of learning rates on validation; loss and read-out are ours for all
+--scale full   a GPU: the paper's sizes and its training (squared error, Adam 0.01, 80 epochs, batch 16, five cosines,
+               32x32 heatmaps) on every frame of the 300 sequences
+
+Hardware   cpu: 2 cores with bfloat16; two shares in two terminals, each with OMP_NUM_THREADS=1, are faster than one run
+           (--share 0/2 and --share 1/2)
+Time       cpu: about 9 hours of two cores; full: not run
+Expected   one small JSON for each training in RESULTS/SCALE, which paper_report.py turns into tables
+
+What is done is kept: stop it at any time and run it again. Only train sequences are trained on; validation chooses
+the learning rate and the weights; test sequences are read by `judge` alone. The detected crop comes from the shipped
+locators, the same for every method.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gknet.atomic import write_text
+from gknet.comparison import Trial
+from gknet.dataset.skd import SkdDataset
+from gknet.estimator import load_estimator
+from gknet.evaluation import evaluate
+from gknet.fleet import NAMES
+from gknet.paper_protocol import PaperEstimator
+from gknet.render.generate import generate
+from gknet.training.checkpoint import CHECKPOINT
+from gknet.training.export import export_run
+from gknet.training.loop import train
+from gknet.training.schedule import Stage
+from gknet.training.settings import TrainSettings
+
+DATA_SEED, SWEEP_SEED = 0, 100
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table. `network` at the scale's sizes."""
+
+    name: str
+    network: str
+    graph: str = "skeleton"
+
+    @property
+    def key(self) -> str:
+        return self.network if self.graph == "skeleton" else f"{self.network}_{self.graph}"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is rendered, trained and judged.
+
+    crops_every, val_every, test_every   frames of a sequence that are rendered
+    sequences, size                      of the data; None renders all, whole
+    seeds                                of each method
+    ablation_seeds                       of gknet with its skeleton and without edges, on ABLATED
+    rates                                learning rates tried for each method on SWEPT, sweep_epochs each
+    """
+
+    methods: tuple[Method, ...]
+    ablation: tuple[Method, ...]
+    crops_every: int
+    val_every: int
+    test_every: int
+    sequences: int | None
+    size: int | None
+    seeds: tuple[int, ...]
+    ablation_seeds: tuple[int, ...]
+    rates: tuple[float, ...]
+    sweep_epochs: float
+    settings: TrainSettings
+
+
+SWEPT = "satellite_02"
+ABLATED = ("satellite_02", "satellite_03")
+
+
+def small(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
+    ours = "gknet-s" if suffix else "gknet-paper"
+    methods = (
+        Method("GKNet", ours),
+        Method("HRNet", f"hrnet{suffix}"),
+        Method("ResUNet", f"resunet{suffix}"),
+    )
+    ablation = (
+        Method("GKNet, no edges", ours, "identity"),
+        Method("GKNet, random edges", ours, "random"),
+        Method("GKNet, no graph branch", ours, "none"),
+    )
+    return methods, ablation
+
+
+CPU_STAGES = (Stage(0.6, 128, 16), Stage(0.4, 192, 16))
+PAPER = TrainSettings(
+    epochs=80,
+    stages=(Stage(1.0, 256, 16),),
+    learning_rate=0.01,
+    weight_decay=0.0,  # AdamW without decay is Adam
+    warm_up=0.0,
+    cycles=5,
+    ema=0.0,
+    validations=10,
+)
+SCALES = {
+    "smoke": Scale(
+        *small("-s"), 10, 20, 20, 5, 256, (0,), (), (2e-3,), 0.2,
+        TrainSettings(epochs=0.5, stages=(Stage(1.0, 64, 8),), validations=1, val_frames=8),
+    ),
+    "cpu": Scale(
+        *small("-s"), 2, 30, 15, None, None, (0,), (1, 2), (1e-3, 2e-3, 4e-3), 1.5,
+        TrainSettings(epochs=9, stages=CPU_STAGES, validations=4, val_frames=100),
+    ),
+    "full": Scale(*small(""), 1, 10, 1, None, None, (0, 1, 2), (), (0.01,), 80, PAPER),
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="folder of data, caches and runs")
+    parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
+    parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")
+    parser.add_argument("--locators", type=Path, help="folder of the models whose locators are used [the shipped ones]")
+    parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--share", default="0/1", metavar="I/N", help="each N-th training, from the I-th on")
+    arguments = parser.parse_args()
+    scale = SCALES[arguments.scale]
+    share, shares = (int(part) for part in arguments.share.split("/"))
+    work, results = arguments.work / arguments.scale, arguments.results / arguments.scale
+    rendered = work / f"rendered_{'_'.join(arguments.spacecraft)}"
+    if share == 0 and not rendered.exists():
+        render(work, scale, arguments.spacecraft)
+        rendered.touch()
+    wait_for(rendered)
+    (results / "sweep").mkdir(parents=True, exist_ok=True)
+    swept = SWEPT if SWEPT in arguments.spacecraft else arguments.spacecraft[0]
+    sweep = [(method.network, rate) for method in scale.methods for rate in scale.rates if len(scale.rates) > 1]
+    for network, rate in sweep[share::shares]:
+        try_rate(work, results, scale, network, rate, swept)
+    rates = {method.network: best_rate(results, scale, method.network) for method in scale.methods}
+    todo = [trial for trial in trials(scale, arguments.spacecraft) if not result_path(results, *trial).exists()]
+    for method, spacecraft, seed in todo[share::shares]:
+        settings = replace(
+            scale.settings,
+            network=method.network,
+            graph=method.graph,
+            learning_rate=rates[method.network],
+            seed=seed,
+        )
+        run = work / "runs" / f"{spacecraft}_{method.key}_{seed}"
+        minutes = run_training(work, spacecraft, run, settings)
+        model = work / "models" / run.name
+        export_run(run, model)
+        locators = arguments.locators or Path(str(shipped_folder()))
+        shutil.copyfile(locators / spacecraft / "locator.onnx", model / "locator.onnx")
+        content = judge(work, model, method, spacecraft, seed)
+        content |= {"learning_rate": settings.learning_rate, "minutes": minutes, "samples": samples_seen(run)}
+        write_text(result_path(results, method, spacecraft, seed), json.dumps(content) + "\n")
+
+
+def render(work: Path, scale: Scale, spacecraft: list[str]) -> None:
+    """Crops to train on; whole frames to validate and to judge on."""
+    frames = {"sequences": scale.sequences, "size": scale.size}
+    for name in spacecraft:
+        crops = {"sequences": scale.sequences}
+        generate("skd", work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every, **crops)
+        generate("skd", work / "frames", DATA_SEED, name, "val", every=scale.val_every, **frames)
+        generate("skd", work / "frames", DATA_SEED, name, "test", every=scale.test_every, **frames)
+
+
+def wait_for(path: Path) -> None:
+    """For what another share makes."""
+    if not path.exists():
+        print(f"waiting for {path}, which another share makes", flush=True)
+    while not path.exists():
+        time.sleep(5)
+
+
+def sweep_path(results: Path, network: str, rate: float) -> Path:
+    return results / "sweep" / f"{network}_{rate:g}.json"
+
+
+def try_rate(work: Path, results: Path, scale: Scale, network: str, rate: float, spacecraft: str) -> None:
+    """A short training; every method has the same number of them."""
+    path = sweep_path(results, network, rate)
+    if path.exists():
+        return
+    settings = replace(
+        scale.settings, network=network, epochs=scale.sweep_epochs, learning_rate=rate, seed=SWEEP_SEED, validations=1
+    )
+    run = work / "runs" / f"sweep_{network}_{rate:g}"
+    minutes = run_training(work, spacecraft, run, settings)
+    best = json.loads((run / "run.json").read_text(encoding="utf-8"))["best"]
+    write_text(path, json.dumps({"spacecraft": spacecraft, "minutes": minutes, **best}) + "\n")
+
+
+def best_rate(results: Path, scale: Scale, network: str) -> float:
+    """The learning rate of the lowest validation score."""
+    if len(scale.rates) == 1:
+        return scale.rates[0]
+    scores = {}
+    for rate in scale.rates:
+        path = sweep_path(results, network, rate)
+        wait_for(path)
+        scores[rate] = json.loads(path.read_text(encoding="utf-8"))["score"]
+    return min(scores, key=lambda rate: scores[rate])
+
+
+def trials(scale: Scale, spacecraft: list[str]) -> Iterator[tuple[Method, str, int]]:
+    """What is trained, the most telling first."""
+    for seed in scale.seeds:
+        for method in (*scale.methods, *scale.ablation):
+            for name in spacecraft:
+                yield method, name, seed
+    for seed in scale.ablation_seeds:
+        for method in (scale.methods[0], scale.ablation[0]):
+            for name in ABLATED:
+                if name in spacecraft:
+                    yield method, name, seed
+
+
+def result_path(results: Path, method: Method, spacecraft: str, seed: int) -> Path:
+    return results / f"{spacecraft}_{method.key}_{seed}.json"
+
+
+def run_training(work: Path, spacecraft: str, out: Path, settings: TrainSettings) -> float:
+    """One training, from where it stopped; its minutes."""
+    resume = (out / CHECKPOINT).exists()
+    state = train(work / "crops", spacecraft, out, settings, resume, work / "cache", val=work / "frames")
+    return round(state.elapsed_s / 60, 2)
+
+
+def samples_seen(run: Path) -> int:
+    """Of the whole run, from the last row of its metrics."""
+    header, *rows = (run / "metrics.csv").read_text(encoding="utf-8").splitlines()
+    return int(float(rows[-1].split(",")[header.split(",").index("samples")]))
+
+
+def shipped_folder() -> object:
+    from importlib import resources
+
+    return resources.files("gknet") / "models"
+
+
+def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -> dict[str, object]:
+    """The test frames under three protocols: the paper's read-out, ours with the oracle's and the detected crop."""
+    estimator = load_estimator(model)
+    dataset = SkdDataset(work / "frames", "test", spacecraft)
+    runs = {run.protocol: run for run in evaluate(dataset, estimator).runs}
+    size = estimator.looking.input_size
+    paper = PaperEstimator(estimator.keypoint_network, estimator.spacecraft, size)
+    runs_by_name = {**runs, "paper": evaluate(dataset, paper, ("oracle",)).runs[0]}
+    return {
+        "name": method.name,
+        **cost(model, method, estimator.keypoint_network, size),
+        "protocols": {
+            name: Trial.of(run, method.key, spacecraft, seed).to_dict() for name, run in runs_by_name.items()
+        },
+    }
+
+
+def cost(model: Path, method: Method, network, size: int) -> dict[str, object]:
+    """Parameters, multiply-accumulates at the deployed size, milliseconds of a crop."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from gknet.network.build import build
+
+    built = build(method.network, network.spacecraft.adjacency, method.graph).eval()
+    with FlopCounterMode(display=False) as counter:
+        built(torch.zeros(1, 3, size, size))
+    image = np.zeros((1, 3, size, size), np.float32)
+    times = []
+    for _ in range(60):
+        start = time.perf_counter()
+        network(image)
+        times.append(time.perf_counter() - start)
+    return {
+        "parameters": sum(parameter.numel() for parameter in built.parameters()),
+        "gmac": counter.get_total_flops() / 2e9,
+        "input_size": size,
+        "ms": 1000 * float(np.median(times)),
+    }
+
+
+if __name__ == "__main__":
+    main()
