@@ -75,7 +75,7 @@ def test_covariance_of_a_spread_heatmap_follows_the_spread() -> None:
     spread = np.array([[1.2, 0.5], [0.5, 0.5]])
     places = generator.multivariate_normal((32.3, 30.7), spread, 3000)
     heatmap = gaussians(places).mean(axis=0, keepdims=True)
-    keypoints = decode_heatmaps(heatmap, 1.0)
+    keypoints = decode_heatmaps(heatmap, 1.0, Decoding(floor_cells=0.15))
     covariance = keypoints.covariance_px2[0]
     assert 0.6 < np.sqrt(np.linalg.det(covariance) / np.linalg.det(spread)) < 1.8
     assert covariance[0, 0] > 1.2 * covariance[1, 1]
@@ -90,14 +90,16 @@ def test_covariance_grows_as_the_score_drops() -> None:
     assert sizes[-1] > 100 * sizes[0]
 
 
-def test_covariance_scale_and_floor() -> None:
+def test_floor_and_spread_scale() -> None:
     one = gaussians(np.array([[20.2, 30.1]]))
-    plain = decode_heatmaps(one, STRIDE, Decoding(floor_cells=0.2)).covariance_px2[0]
-    np.testing.assert_allclose(plain, (0.2 * STRIDE) ** 2 * np.eye(2), atol=1e-4)
-    scaled = decode_heatmaps(one, STRIDE, Decoding(floor_cells=0.2, covariance_scale=3)).covariance_px2[0]
-    np.testing.assert_allclose(scaled, 3 * plain)
+    sure = decode_heatmaps(one, STRIDE, Decoding(floor_cells=0.2)).covariance_px2[0]
+    np.testing.assert_allclose(sure, (0.2 * STRIDE) ** 2 * np.eye(2), atol=1e-3)
+    floor = 0.2**2 * np.eye(2)
+    once, thrice = (decode_heatmaps(0.6 * one, 1.0, Decoding(0.2, scale)).covariance_px2[0] for scale in (1, 3))
+    assert np.linalg.eigvalsh(once).min() > 0.5
+    np.testing.assert_allclose(thrice - floor, 3 * (once - floor))
     with pytest.raises(GknetError, match="positive"):
-        Decoding(covariance_scale=0)
+        Decoding(spread_scale=0)
 
 
 def test_covariance_is_positive_definite_on_noise() -> None:

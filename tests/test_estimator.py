@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gknet.estimator as estimating
+from gknet.decode import Decoding
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, Looking, check_image, load_estimator, shipped_models
 from gknet.frame import Box, Frame
@@ -256,13 +257,20 @@ def test_load_from_a_folder(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     from tests.test_onnx_network import METADATA, write_pool
 
-    keypoints = METADATA | {"input_size": 32, "covariance_scale": 2.0, "spacecraft": spacecraft_toml(CRAFT)}
+    keypoints = METADATA | {
+        "input_size": 32,
+        "floor_cells": 0.4,
+        "spread_scale": 2.0,
+        "pose_scale": 1.5,
+        "spacecraft": spacecraft_toml(CRAFT),
+    }
     write_pool(tmp_path / "keypoints.onnx", json.dumps(keypoints), size=32)
     estimator = load_estimator(tmp_path, threads=1)
     assert estimator.locator is None
     assert estimator.spacecraft.name == "probe"
     assert estimator.looking.input_size == 32
-    assert estimator.decoding.covariance_scale == 2.0
+    assert estimator.decoding == Decoding(floor_cells=0.4, spread_scale=2.0)
+    assert estimator.pnp.covariance_scale == 1.5
     write_pool(tmp_path / "locator.onnx", json.dumps(keypoints), size=32)
     with pytest.raises(GknetError, match="kind 'locator'"):
         load_estimator(tmp_path)

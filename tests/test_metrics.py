@@ -16,7 +16,6 @@ from gknet.frame import Box, Estimate, Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.metrics import (
     FrameErrors,
-    covariance_scale,
     errors,
     nees,
     oracle_crop,
@@ -190,20 +189,6 @@ def test_summary_is_deterministic_and_json() -> None:
     first, second = (json.dumps(summarise(frames, seed=1).to_dict(), allow_nan=False) for _ in range(2))
     assert first == second
     assert json.loads(first)["metrics"]["e_t"]["frames"] == 40
-
-
-def test_covariance_scale_finds_the_factor() -> None:
-    generator = np.random.default_rng(0)
-    pairs = []
-    for _ in range(100):
-        keypoints = estimate_at(POSE).keypoints
-        assert keypoints is not None
-        pixels = keypoints.pixels + generator.normal(0, 1.5, (12, 2))
-        pixels[0] += 100
-        pairs.append((Keypoints(pixels, keypoints.score, keypoints.covariance_px2), FRAME))
-    assert covariance_scale(pairs, CRAFT) == pytest.approx(1.5**2, rel=0.25)
-    with pytest.raises(GknetError, match="got none"):
-        covariance_scale([], CRAFT)
 
 
 def test_box_off_the_target_has_no_overlap() -> None:

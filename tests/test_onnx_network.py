@@ -45,7 +45,7 @@ def test_runs_and_tells_what_it_is(tmp_path: Path) -> None:
     images = np.random.default_rng(0).random((2, 3, 16, 16), dtype=np.float32)
     np.testing.assert_allclose(network(images), images.reshape(2, 3, 4, 4, 4, 4).mean(axis=(3, 5)), rtol=1e-5)
     assert network.metadata.stride == 4
-    assert network.metadata.covariance_scale == 1.0
+    assert network.metadata.spread_scale == network.metadata.pose_scale == 1.0
     assert network.spacecraft.keypoint_names == CRAFT.keypoint_names
     np.testing.assert_allclose(network.spacecraft.points_m, CRAFT.points_m)
     assert network.spacecraft.mesh_path is None

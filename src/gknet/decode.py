@@ -36,17 +36,18 @@ LEANING = 0.1
 class Decoding:
     """How sure a peak is believed to be.
 
-    floor_cells       standard deviation per axis of a perfect peak
-    covariance_scale  multiplies every covariance; found on a validation split so that errors match it
+    floor_cells   standard deviation per axis of a perfect peak
+    spread_scale  multiplies the covariance that a peak's height and width tell
+    Both are fitted on a validation split (calibration.py).
     """
 
-    floor_cells: float = 0.15
-    covariance_scale: float = 1.0
+    floor_cells: float = 0.3
+    spread_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (self.floor_cells > 0 and self.covariance_scale > 0):
+        if not (self.floor_cells > 0 and self.spread_scale > 0):
             raise GknetError(
-                f"decoding: expected a positive floor and scale, got {self.floor_cells} and {self.covariance_scale}"
+                f"decoding: expected a positive floor and scale, got {self.floor_cells} and {self.spread_scale}"
             )
 
 
@@ -68,8 +69,8 @@ def decode_heatmaps(heatmaps: Float[ndarray, "n h w"], stride: float, decoding: 
     score = np.where(found, np.clip(peak, 0.0, 1.0), 0.0)
     cells = np.stack([columns, rows], axis=1) + 0.5 + offset
     inflation = (1 - score) / np.maximum(score, NO_PEAK)
-    covariance = moments * inflation[:, None, None] + decoding.floor_cells**2 * np.eye(2)
-    covariance *= decoding.covariance_scale
+    spread = moments * inflation[:, None, None]
+    covariance = decoding.spread_scale * spread + decoding.floor_cells**2 * np.eye(2)
 
     height, width = heatmaps.shape[1:]
     cells[~found] = width / 2, height / 2

@@ -139,7 +139,10 @@ class Estimator:
         return keypoints_to_image(keypoints, crop)
 
     def _estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box, crop: Crop) -> Estimate:
-        keypoints = self.detect(image, crop)
+        return self.pose_of(self.detect(image, crop), camera, box, crop)
+
+    def pose_of(self, keypoints: Keypoints, camera: Camera, box: Box, crop: Crop) -> Estimate:
+        """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none."""
         result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp)
         if not isinstance(result, PnpResult):
             return Estimate(keypoints, box=box, failure=result)
@@ -214,5 +217,6 @@ def load_estimator(name_or_folder: str | Path, threads: int | None = None, devic
             input_size=keypoint_network.metadata.input_size,
             locator_size=locator.metadata.input_size if locator else Looking.locator_size,
         ),
-        Decoding(covariance_scale=keypoint_network.metadata.covariance_scale),
+        Decoding(keypoint_network.metadata.floor_cells, keypoint_network.metadata.spread_scale),
+        PnpSettings(covariance_scale=keypoint_network.metadata.pose_scale),
     )

@@ -157,26 +157,6 @@ def nees(truth: Pose, estimate: Estimate) -> float | None:
     return float((error / scale) @ np.linalg.solve(unit, error / scale))
 
 
-def covariance_scale(
-    pairs: Sequence[tuple[Keypoints, Frame]], spacecraft: Spacecraft, min_score: float = 0.15
-) -> float:
-    """The factor for `Decoding.covariance_scale` that makes the keypoints' covariances fit their errors.
-
-    It matches the median squared Mahalanobis distance, so swapped keypoints (outliers for the pose) do not blow it up.
-    """
-    found = []
-    for keypoints, frame in pairs:
-        true_px = frame.keypoints_px(spacecraft.points_m)
-        use = frame.camera.contains(true_px) & (keypoints.score >= min_score)
-        error = (keypoints.pixels - true_px)[use]
-        information = np.linalg.inv(keypoints.covariance_px2[use])
-        found.append(np.einsum("ki,kij,kj->k", error, information, error))
-    squared = np.concatenate(found) if found else np.zeros(0)
-    if len(squared) == 0:
-        raise GknetError("covariance scale: expected frames with detected keypoints in view, got none")
-    return float(np.median(squared) / chi2.ppf(0.5, 2))
-
-
 def _rms(distance: Float[ndarray, "k"]) -> float | None:
     return float(np.sqrt((distance**2).mean())) if len(distance) else None
 

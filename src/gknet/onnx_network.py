@@ -26,7 +26,7 @@ class Metadata(BaseModel):
     spacecraft        the text of the spacecraft's .toml: channel k of a keypoint network is its keypoint k
     stride            input pixels per cell of the output
     tolerance         the largest difference from the trained network that the export allowed
-    covariance_scale  of the decoded keypoints, from the validation split
+    floor_cells, spread_scale, pose_scale   how sure keypoints and poses are (calibration.py), from the validation split
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -38,7 +38,9 @@ class Metadata(BaseModel):
     stride: int = Field(gt=0)
     input_size: int = Field(gt=0)
     tolerance: FiniteFloat
-    covariance_scale: FiniteFloat = Field(default=1.0, gt=0)
+    floor_cells: FiniteFloat = Field(default=0.3, gt=0)
+    spread_scale: FiniteFloat = Field(default=1.0, gt=0)
+    pose_scale: FiniteFloat = Field(default=1.0, gt=0)
 
 
 class OnnxNetwork:

@@ -28,6 +28,7 @@ class PnpSettings:
     threshold_px     a keypoint nearer than this to its projection is an inlier; tried in order until a pose comes
     min_inliers      and at least this fraction of the keypoints used
     max_rms_px       of the inliers' reprojection errors
+    covariance_scale of the pose: keypoints of one picture err alike, more than independent ones; from calibration.py
     """
 
     min_score: float = 0.15
@@ -35,10 +36,13 @@ class PnpSettings:
     min_inliers: int = 5
     min_inlier_fraction: float = 0.3
     max_rms_px: float = 10.0
+    covariance_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.threshold_px or min(self.threshold_px) <= 0:
             raise GknetError(f"pnp: expected positive thresholds, got {self.threshold_px}")
+        if not self.covariance_scale > 0:
+            raise GknetError(f"pnp: expected a positive covariance scale, got {self.covariance_scale}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +127,7 @@ def _solve(
     covariance = _covariance(problem, pose, inliers)
     if covariance is None:
         return "the keypoints do not fix the pose (they lie on a line)"
-    return PnpResult(pose, covariance, inliers, rms)
+    return PnpResult(pose, settings.covariance_scale * covariance, inliers, rms)
 
 
 def _consensus(problem: _Problem, score: Float[ndarray, "k"], threshold_px: float) -> Pose | None:

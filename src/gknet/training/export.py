@@ -159,7 +159,7 @@ def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:
         "stride": network.stride,
         "input_size": run.input_size,
         "tolerance": tolerance,
-        "covariance_scale": best.get("covariance_scale", 1.0),
+        **{name: best[name] for name in ("floor_cells", "spread_scale", "pose_scale") if name in best},
         "validation": best,
     }
 

@@ -56,7 +56,7 @@ class KeypointTask:
     def validate(
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
     ) -> Validation:
-        return validate_keypoints(network, device, frames, rows, self.spacecraft, self.input_size)
+        return validate_keypoints(cast(HeatmapNetwork, network), device, frames, rows, self.spacecraft, self.input_size)
 
 
 @dataclass(frozen=True)

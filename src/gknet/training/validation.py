@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,13 +12,13 @@ from numpy import ndarray
 from torch import nn
 
 from gknet import metrics
+from gknet.calibration import BARE, calibrated, sight
+from gknet.decode import Decoding
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, Looking
-from gknet.frame import Frame, Keypoints
+from gknet.frame import Frame
+from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
-
-UNFOUND_COVARIANCE_SCALE = 1.0
-"""Where no keypoint was sure enough to measure it."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def validation_rows(count: int, wanted: int) -> list[int]:
 
 
 def validate_keypoints(
-    network: nn.Module,
+    network: HeatmapNetwork,
     device: torch.device,
     frames: Sequence[Frame],
     rows: Sequence[int],
@@ -70,22 +70,14 @@ def validate_keypoints(
 ) -> Validation:
     """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
     network.eval()
-    estimator = Estimator(
-        numpy_network(network, device), spacecraft, looking=Looking(input_size=input_size, refine_crop=False)
-    )
-    errors: list[metrics.FrameErrors] = []
-    pairs: list[tuple[Keypoints, Frame]] = []
-    for frame in _usable(frames, rows, spacecraft):
-        assert frame.image is not None
-        box = frame.true_box(spacecraft.points_m)
-        estimate = estimator.estimate(frame.image, frame.camera, box)
-        errors.append(metrics.errors(frame, estimate, spacecraft))
-        if estimate.keypoints is not None:
-            pairs.append((estimate.keypoints, frame))
+    looking = Looking(input_size=input_size, refine_crop=False)
+    bare = Estimator(numpy_network(network, device), spacecraft, looking=looking, decoding=BARE)
+    sights = [sight(frame, bare, network.stride) for frame in _usable(frames, rows, spacecraft)]
     try:
-        scale = metrics.covariance_scale(pairs, spacecraft)
-    except GknetError:
-        scale = UNFOUND_COVARIANCE_SCALE
+        estimator = calibrated(bare, sights)
+    except GknetError:  # nothing was sure enough yet
+        estimator = replace(bare, decoding=Decoding())
+    errors = [metrics.errors(s.frame, s.estimate(estimator), spacecraft) for s in sights]
     values = {
         "rmse_px": float(np.mean([error.rmse_px for error in errors])),
         "median_px": float(np.median([error.rmse_px for error in errors])),
@@ -93,7 +85,9 @@ def validate_keypoints(
         "e_t": float(np.mean([error.e_t for error in errors])),
         "e_q_rad": float(np.mean([error.e_q_rad for error in errors])),
         "failures": float(np.mean([error.failure is not None for error in errors])),
-        "covariance_scale": scale,
+        "floor_cells": estimator.decoding.floor_cells,
+        "spread_scale": estimator.decoding.spread_scale,
+        "pose_scale": estimator.pnp.covariance_scale,
     }
     return Validation(values["rmse_px"], values)
 
