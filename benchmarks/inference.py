@@ -1,7 +1,9 @@
-"""Milliseconds from pixels to pose, at one and two threads, as ratios to the paper-sized network when it is given.
+"""Milliseconds from pixels to pose, at one and two threads, as ratios to gknet-paper with --paper.
 
-    python benchmarks/inference.py satellite_01 --paper gknet-paper.onnx
+    python benchmarks/inference.py satellite_01 --paper
 
+--paper needs the extra `train`: it makes the network of the paper's size with random weights, whose speed is that of
+any others.
 `satellite_01` is a shipped model or a folder with keypoints.onnx and locator.onnx. Each figure is the median of
 `--runs` calls on one thread setting, after a warm-up; the picture is noise, which costs the networks what any picture
 does. The pose solver is timed on the projected keypoints with noise, since noise alone has no pose.
@@ -11,11 +13,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 from rich.console import Console
 from rich.table import Table
 
@@ -25,7 +29,6 @@ from gknet.errors import GknetError
 from gknet.estimator import Estimator, load_estimator, network_input
 from gknet.frame import Keypoints
 from gknet.geometry import Camera, Pose
-from gknet.onnx_network import OnnxNetwork
 from gknet.pnp import solve_pnp
 
 CAMERA = Camera.from_focal(1400, 1024, 1024)
@@ -68,23 +71,42 @@ def stages(estimator: Estimator, runs: int) -> dict[str, float]:
     return found
 
 
+def write_paper_network(path: Path) -> None:
+    """gknet-paper for 16 keypoints on a chain, normalisations folded, as an export would have it."""
+    import onnx
+    import torch
+
+    from gknet.network.build import gknet_paper
+    from gknet.training.export import folded, onnx_graph
+
+    chain = np.eye(16, dtype=bool) | np.eye(16, k=1, dtype=bool) | np.eye(16, k=-1, dtype=bool)
+    onnx.save(onnx_graph(folded(gknet_paper(chain)), torch.zeros(2, 3, 256, 256)), path)
+
+
 def paper_ms(path: Path, threads: int, runs: int) -> float:
-    network = OnnxNetwork(path, threads)
-    size = network.metadata.input_size
-    given = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
-    return median_ms(lambda: network(given), max(3, runs // 10))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    given = np.random.default_rng(0).random((1, 3, 256, 256), dtype=np.float32)
+    return median_ms(lambda: session.run(None, {"image": given}), max(3, runs // 10))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx")
-    parser.add_argument("--paper", type=Path, help="gknet-paper exported to ONNX, the unit of the ratios")
+    parser.add_argument("--paper", action="store_true", help="time gknet-paper too, the unit of the ratios")
     parser.add_argument("--runs", type=int, default=100)
     chosen = parser.parse_args()
 
     table = Table("stage", "threads", "ms", "of gknet-paper", title=f"inference, {chosen.model}")
+    paper_times: dict[int, float] = {}
+    if chosen.paper:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "gknet-paper.onnx"
+            write_paper_network(path)
+            paper_times = {threads: paper_ms(path, threads, chosen.runs) for threads in (1, 2)}
     for threads in (1, 2):
-        paper = paper_ms(chosen.paper, threads, chosen.runs) if chosen.paper else None
+        paper = paper_times.get(threads)
         for stage, ms in stages(load_estimator(chosen.model, threads), chosen.runs).items():
             table.add_row(stage, str(threads), f"{ms:.2f}", f"1/{paper / ms:.0f}" if paper else "-")
         if paper:
