@@ -1,0 +1,51 @@
+"""The recipe of the paper's tables from rendering to Markdown, at its smallest scale: every stage runs and resumes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+CRAFT = "satellite_01"
+METHODS = ("gknet-s", "hrnet-s", "resunet-s", "gknet-s_identity", "gknet-s_random", "gknet-s_none")
+
+
+def recipe(name: str, *words: object) -> str:
+    command = [sys.executable, str(ROOT / "recipes" / name), *map(str, words)]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert run.returncode == 0, f"{run.stdout[-2000:]}\n{run.stderr[-3000:]}"
+    return run.stdout
+
+
+def test_smoke(tmp_path: Path) -> None:
+    words = ("--scale", "smoke", "--work", tmp_path / "work", "--results", tmp_path / "results")
+    recipe("paper_tables.py", *words, "--spacecraft", CRAFT)
+    folder = tmp_path / "results" / "smoke"
+    kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.json")}
+    assert set(kept) == {f"{CRAFT}_{method}_0.json" for method in METHODS}
+    for path in folder.glob("*.json"):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        assert content["samples"] > 0
+        protocols = content["protocols"]
+        assert set(protocols) == {"oracle", "detected", "paper"}
+        frames = [protocol["frames"] for protocol in protocols.values()]
+        assert frames[0] == frames[1] == frames[2]
+        assert len(frames[0]) >= 10
+        assert len(protocols["paper"]["values"]["e_t"]) == len(frames[0])
+
+    recipe("paper_tables.py", *words, "--spacecraft", CRAFT)  # all is there: nothing is made again
+    assert kept == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.json")}
+
+    text = recipe("paper_report.py", "--scale", "smoke", "--results", tmp_path / "results")
+    assert text.strip() == (folder / "README.md").read_text(encoding="utf-8").strip()
+    for words_of_a_table in ("Table 1", "Table 2", "Table 3", "Swaps", "29.11", "0.763"):
+        assert words_of_a_table in text
+    assert "nan" not in text
