@@ -22,9 +22,9 @@ LAYERS = (
     {"decode", "onnx_network", "pnp"},
     {"fleet", "dataset", "network", "pose_file"},
     {"camera_file", "estimator", "metrics"},
-    {"source"},
+    {"calibration", "paper_protocol", "source"},
     {"evaluation"},
-    {"report"},
+    {"comparison", "report"},
     {"prediction", "render", "training"},
     {"cli"},
 )
