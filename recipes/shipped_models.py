@@ -95,7 +95,7 @@ def train_all(work: Path, scale: Scale, start: Path | None) -> None:
         keypoints.append((work, "crops", name, runs / f"{name}_keypoints", settings))
         init = None if start is None else start / name / "locator.safetensors"
         settings = TrainSettings(
-            "locator", minutes=scale.locator_minutes, validations=3, val_frames=100, seed=TRAINING_SEED, init=init
+            "locator", minutes=scale.locator_minutes, validations=3, val_frames=200, seed=TRAINING_SEED, init=init
         )
         locators.append((work, "pictures", name, runs / f"{name}_locator", settings))
     threads = max(1, (os.cpu_count() or 1) // scale.jobs)
@@ -115,7 +115,7 @@ def run(job: Job, quiet: bool = True) -> str:
 
 def keypoint_settings(minutes: float, stages: tuple[Stage, ...], init: Path | None) -> TrainSettings:
     return TrainSettings(
-        "gknet-s", minutes=minutes, stages=stages, validations=6, val_frames=100, seed=TRAINING_SEED, init=init
+        "gknet-s", minutes=minutes, stages=stages, validations=6, val_frames=200, seed=TRAINING_SEED, init=init
     )
 
 

@@ -44,8 +44,8 @@ def table(results: Path, recipe: str) -> str:
     """Markdown: mean, median of the headline figures; a row for each spacecraft and crop."""
     shown = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
     lines = [
-        "| spacecraft, crop | frames | no pose | " + " | ".join(COLUMNS[name] for name in shown) + " | IoU >= 0.7 |",
-        "|---" * (len(shown) + 4) + "|",
+        "| spacecraft, crop | frames | no pose | " + " | ".join(COLUMNS[name] for name in shown) + " | in 95 % | IoU >= 0.7 |",
+        "|---" * (len(shown) + 5) + "|",
     ]
     for name in NAMES:
         runs = json.loads((results / f"{name}_{recipe}.json").read_text(encoding="utf-8"))["runs"]
@@ -55,7 +55,7 @@ def table(results: Path, recipe: str) -> str:
             pairs = [(run["metrics"][column]["mean"], run["metrics"][column]["median"]) for column in shown]
             cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
             cells += [f"{mean:.3g}, {median:.3g}" for mean, median in pairs]
-            lines.append("| " + " | ".join([*cells, located]) + " |")
+            lines.append("| " + " | ".join([*cells, f"{100 * run['coverage_95']:.0f} %", located]) + " |")
     return "\n".join(lines)
 
 
@@ -63,8 +63,8 @@ def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
     lines += [
-        "Trained on rendered pictures alone (recipe `skd`, seed 0), by the stages of `recipes/shipped_models.py`;",
-        "the package's README says where the runs differed from it.",
+        "Trained on rendered pictures alone (recipe `skd`, seed 0) by `recipes/shipped_models.py`; the package's README",
+        "says how. Keypoint errors in pixels of the 256 crop.",
         "",
     ]
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
@@ -82,6 +82,8 @@ def card(models: Path, results: Path, name: str) -> str:
         for column, words in COLUMNS.items():
             cells = [statistic(runs[protocol], column) for protocol in PROTOCOLS]
             lines.append(f"| {words} | " + " | ".join(cells) + " |")
+        covered = [f"{100 * runs[protocol]['coverage_95']:.0f} %" for protocol in PROTOCOLS]
+        lines.append("| true poses in the 95 % ellipsoid | " + " | ".join(covered) + " |")
     lines += [
         "",
         "## Limits",
