@@ -44,7 +44,9 @@ def table(results: Path, recipe: str) -> str:
     """Markdown: mean, median of the headline figures; a row for each spacecraft and crop."""
     shown = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
     lines = [
-        "| spacecraft, crop | frames | no pose | " + " | ".join(COLUMNS[name] for name in shown) + " | in 95 % | IoU >= 0.7 |",
+        "| spacecraft, crop | frames | no pose | "
+        + " | ".join(COLUMNS[name] for name in shown)
+        + " | in 95 % | IoU >= 0.7 |",
         "|---" * (len(shown) + 5) + "|",
     ]
     for name in NAMES:
@@ -63,8 +65,8 @@ def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
     lines += [
-        "Trained on rendered pictures alone (recipe `skd`, seed 0) by `recipes/shipped_models.py`; the package's README",
-        "says how. Keypoint errors in pixels of the 256 crop.",
+        "Trained on rendered pictures alone (recipe `skd`, seed 0) by `recipes/shipped_models.py`; the README of",
+        "the package says how. Keypoint errors in pixels of the 256 crop.",
         "",
     ]
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
