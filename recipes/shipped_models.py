@@ -62,7 +62,7 @@ class Scale:
 
 
 SCALES = {
-    "cpu": Scale(2, 6, 30, 15, 17, (60, 50, 50), 16, KEYPOINT_STAGES, 2),
+    "cpu": Scale(2, 6, 30, 15, 17, (60, 76, 50), 11, KEYPOINT_STAGES, 2),
     "full": Scale(1, 1, 10, 1, 60, (600, 600, 600), 60, FULL_STAGES, 1),
 }
 
