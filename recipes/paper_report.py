@@ -203,4 +203,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except GknetError as error:
+        raise SystemExit(f"error: {error}") from error

@@ -1,4 +1,4 @@
-"""The paper's comparison, run fairly: GKNet, HRNet, ResUNet and DMANet, and GKNet with other graphs.
+"""The paper's comparison, run fairly: GKNet, HRNet and ResUNet, and GKNet with other graphs. DMANet is yet to come.
 
     pip install '.[render,train]'
     python recipes/paper_tables.py --scale cpu --work runs/paper --results results/paper_tables
@@ -32,9 +32,11 @@ from pathlib import Path
 
 import numpy as np
 
+import gknet
 from gknet.atomic import write_text
 from gknet.comparison import Trial
 from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
 from gknet.estimator import load_estimator
 from gknet.evaluation import evaluate
 from gknet.fleet import NAMES
@@ -47,6 +49,7 @@ from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
 
 DATA_SEED, SWEEP_SEED = 0, 100
+SHIPPED = Path(gknet.__file__).parent / "models"
 
 
 @dataclass(frozen=True)
@@ -91,9 +94,9 @@ SWEPT = "satellite_02"
 ABLATED = ("satellite_02", "satellite_03")
 
 
-def small(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
+def methods(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
     ours = "gknet-s" if suffix else "gknet-paper"
-    methods = (
+    table = (
         Method("GKNet", ours),
         Method("HRNet", f"hrnet{suffix}"),
         Method("ResUNet", f"resunet{suffix}"),
@@ -103,7 +106,7 @@ def small(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
         Method("GKNet, random edges", ours, "random"),
         Method("GKNet, no graph branch", ours, "none"),
     )
-    return methods, ablation
+    return table, ablation
 
 
 CPU_STAGES = (Stage(0.6, 128, 16), Stage(0.4, 192, 16))
@@ -119,15 +122,22 @@ PAPER = TrainSettings(
 )
 SCALES = {
     "smoke": Scale(
-        *small("-s"), 10, 20, 20, 5, 256, (0,), (), (2e-3,), 0.2,
+        *methods("-s"), 10, 20, 20, 5, 256, (0,), (), (2e-3,), 0.2,
         TrainSettings(epochs=0.5, stages=(Stage(1.0, 64, 8),), validations=1, val_frames=8),
     ),
     "cpu": Scale(
-        *small("-s"), 2, 30, 15, None, None, (0,), (1, 2), (1e-3, 2e-3, 4e-3), 1.5,
+        *methods("-s"), 2, 30, 15, None, None, (0,), (1, 2), (1e-3, 2e-3, 4e-3), 1.5,
         TrainSettings(epochs=9, stages=CPU_STAGES, validations=4, val_frames=100),
     ),
-    "full": Scale(*small(""), 1, 10, 1, None, None, (0, 1, 2), (), (0.01,), 80, PAPER),
+    "full": Scale(*methods(""), 1, 10, 1, None, None, (0, 1, 2), (), (0.01,), 80, PAPER),
 }  # fmt: skip
+
+
+def parse_share(text: str) -> tuple[int, int]:
+    share, shares = (int(part) for part in text.split("/"))  # argparse turns a ValueError into one line
+    if not 0 <= share < shares:
+        raise ValueError(text)
+    return share, shares
 
 
 def main() -> None:
@@ -135,12 +145,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder of data, caches and runs")
     parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
     parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")
-    parser.add_argument("--locators", type=Path, help="folder of the models whose locators are used [the shipped ones]")
+    parser.add_argument("--locators", type=Path, default=SHIPPED, help="folder of the locators [the shipped ones]")
     parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES))
-    parser.add_argument("--share", default="0/1", metavar="I/N", help="each N-th training, from the I-th on")
+    parser.add_argument(
+        "--share", type=parse_share, default=(0, 1), metavar="I/N", help="each N-th training, from the I-th on"
+    )
     arguments = parser.parse_args()
     scale = SCALES[arguments.scale]
-    share, shares = (int(part) for part in arguments.share.split("/"))
+    share, shares = arguments.share
     work, results = arguments.work / arguments.scale, arguments.results / arguments.scale
     rendered = work / f"rendered_{'_'.join(arguments.spacecraft)}"
     if share == 0 and not rendered.exists():
@@ -166,8 +178,7 @@ def main() -> None:
         minutes = run_training(work, spacecraft, run, settings)
         model = work / "models" / run.name
         export_run(run, model)
-        locators = arguments.locators or Path(str(shipped_folder()))
-        shutil.copyfile(locators / spacecraft / "locator.onnx", model / "locator.onnx")
+        shutil.copyfile(arguments.locators / spacecraft / "locator.onnx", model / "locator.onnx")
         content = judge(work, model, method, spacecraft, seed)
         content |= {"learning_rate": settings.learning_rate, "minutes": minutes, "samples": samples_seen(run)}
         write_text(result_path(results, method, spacecraft, seed), json.dumps(content) + "\n")
@@ -251,12 +262,6 @@ def samples_seen(run: Path) -> int:
     return int(float(rows[-1].split(",")[header.split(",").index("samples")]))
 
 
-def shipped_folder() -> object:
-    from importlib import resources
-
-    return resources.files("gknet") / "models"
-
-
 def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -> dict[str, object]:
     """The test frames under three protocols: the paper's read-out, ours with the oracle's and the detected crop."""
     estimator = load_estimator(model)
@@ -299,4 +304,7 @@ def cost(model: Path, method: Method, network, size: int) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except GknetError as error:
+        raise SystemExit(f"error: {error}") from error

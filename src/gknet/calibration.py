@@ -26,9 +26,6 @@ from gknet.metrics import nees
 FREEDOM = 4.0
 """Of the Student distribution that is fitted: its tails leave room for swaps, which are outliers of the pose."""
 
-MIN_SCORE = 0.15
-"""Keypoints below it serve no pose (PnpSettings)."""
-
 FEWEST = 30
 """Keypoints to fit to, and poses."""
 
@@ -72,7 +69,7 @@ def calibrated(estimator: Estimator, sights: Sequence[Sight]) -> Estimator:
     errors, spreads = [], []
     for seen in sights:
         true_px = seen.frame.keypoints_px(points_m)
-        use = seen.frame.camera.contains(true_px) & (seen.keypoints.score >= MIN_SCORE)
+        use = seen.frame.camera.contains(true_px) & (seen.keypoints.score >= estimator.pnp.min_score)
         errors.append((seen.keypoints.pixels - true_px)[use] * seen.cells_per_px)
         spreads.append(seen.keypoints.covariance_px2[use] * seen.cells_per_px**2)
     if sum(len(error) for error in errors) < FEWEST:

@@ -20,6 +20,8 @@ from gknet.network.resunet import ResUNet, ResUNetConfig
 Network = HeatmapNetwork | Locator
 NETWORKS = ("gknet-s", "gknet-paper", "hrnet", "hrnet-s", "resunet", "resunet-s", "locator")
 GRAPH_NETWORKS = ("gknet-s", "gknet-paper")
+"""Those that have a graph to choose."""
+
 PAPER_STRIDE = 8
 """The paper holds every method to heatmaps of 32x32 at 256x256."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Literal, NamedTuple, get_args
 
 from jaxtyping import Float
@@ -15,6 +16,9 @@ SIGMA_CELLS = 1.5
 
 SHARPNESS = 10.0
 """From maps, which rise by about 1 at a keypoint, to logits: e^10 outweighs the cells of a 64x64 map."""
+
+STRIDES = (4, 8)
+"""Input pixels per cell: 64x64 or, as in the paper, 32x32 heatmaps of a 256x256 input."""
 
 Loss = Literal["likelihood", "squared"]
 
@@ -46,7 +50,7 @@ class Branches(NamedTuple):
     nodes: Tensor | None
 
 
-class HeatmapNetwork(nn.Module):
+class HeatmapNetwork(nn.Module, ABC):
     """Image -> one heatmap per keypoint, peak near 1; channel k is keypoint k.
 
     loss    "likelihood": the maps are logits of where the keypoint is (decision 0007); "squared": they are heatmaps
@@ -58,11 +62,13 @@ class HeatmapNetwork(nn.Module):
 
     def __init__(self, loss: str, stride: int) -> None:
         super().__init__()
+        if stride not in STRIDES:
+            raise GknetError(f"network: expected a stride of {STRIDES[0]} or {STRIDES[1]}, got {stride}")
         self.loss, self.stride = checked_loss(loss), stride
 
+    @abstractmethod
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
         """The maps and what each branch contributed, for a loss on all of them."""
-        raise NotImplementedError
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n hs ws"]:
         """RGB in 0 to 1 -> heatmaps."""

@@ -109,8 +109,6 @@ class HRNet(HeatmapNetwork):
 
     def __init__(self, config: HRNetConfig, keypoints: int, loss: str = "likelihood", stride: int = 4) -> None:
         super().__init__(loss, stride)
-        if stride not in (4, 8):
-            raise GknetError(f"hrnet: expected a stride of 4 or 8, got {stride}")
         self.config = config
         stem, outer = config.stem_width, 4 * config.stem_width
         self.stem = nn.Sequential(ConvNorm(3, stem, 3, 2), ConvNorm(stem, stem, 3, 2))

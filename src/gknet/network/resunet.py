@@ -36,8 +36,6 @@ class ResUNet(HeatmapNetwork):
 
     def __init__(self, config: ResUNetConfig, keypoints: int, loss: str = "likelihood", stride: int = 4) -> None:
         super().__init__(loss, stride)
-        if stride not in (4, 8):
-            raise GknetError(f"resunet: expected a stride of 4 or 8, got {stride}")
         self.config = config
         widths = [config.width * 2**level for level in range(4)]
         self.stem = nn.Sequential(ConvNorm(3, widths[0], 7, 2), nn.MaxPool2d(3, 2, 1))

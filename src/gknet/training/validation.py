@@ -70,7 +70,7 @@ def validate_keypoints(
 ) -> Validation:
     """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
     network.eval()
-    looking = Looking(input_size=input_size, refine_crop=False)
+    looking = Looking(input_size=input_size)
     bare = Estimator(numpy_network(network, device), spacecraft, looking=looking, decoding=BARE)
     sights = [sight(frame, bare, network.stride) for frame in _usable(frames, rows, spacecraft)]
     try:
