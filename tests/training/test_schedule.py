@@ -57,3 +57,23 @@ def test_settings_name_what_is_wrong() -> None:
         TrainSettings(epochs=1, learning_rate=0)
     with pytest.raises(GknetError, match="ema"):
         TrainSettings(epochs=1, ema=1.0)
+
+
+def test_warm_restarts() -> None:
+    rates = [learning_rate(1.0, k / 100, 0.0, cycles=5) for k in range(101)]
+    assert [k for k in range(100) if rates[k] > 0.999] == [0, 20, 40, 60, 80]
+    assert rates[100] == pytest.approx(0)
+    assert rates[30] == pytest.approx(0.5)
+    assert max(rates[15:20]) < 0.2
+
+
+def test_choices_that_a_network_does_not_have_are_refused() -> None:
+    for network in ("hrnet-s", "resunet", "locator"):
+        with pytest.raises(GknetError, match="graph"):
+            TrainSettings(network, "identity", epochs=1)
+    with pytest.raises(GknetError, match="loss"):
+        TrainSettings("locator", loss="squared", epochs=1)
+    with pytest.raises(GknetError, match="cycles"):
+        TrainSettings(epochs=1, cycles=0)
+    assert TrainSettings("hrnet", epochs=1).chosen_loss == "squared"
+    assert TrainSettings("hrnet", loss="likelihood", epochs=1).chosen_loss == "likelihood"

@@ -241,7 +241,8 @@ def _outcomes(root: Path, options: Options, plans: list[SequencePlan], workers: 
     except BrokenProcessPool as error:
         raise GknetError(
             "a rendering process died (out of memory, or Mitsuba aborted); run the same command again to go on, "
-            "with --workers 1 or GKNET_MITSUBA_VARIANT=scalar_rgb if it happens again"
+            "with --workers 1 or GKNET_MITSUBA_VARIANT=scalar_rgb if it happens again; a script of your own needs "
+            "if __name__ == '__main__' about its call"
         ) from error
     finally:
         executor.shutdown(wait=True, cancel_futures=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gknet.atomic import write_text
 from gknet.errors import GknetError
-from gknet.network.build import NETWORKS, default_loss
+from gknet.network.build import GRAPH_NETWORKS, NETWORKS, default_loss
 from gknet.network.graph import checked_graph
 from gknet.network.heatmap import checked_loss
 from gknet.training.cache import Window
@@ -69,9 +69,10 @@ class TrainSettings:
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{self.network}'")
-        checked_graph(self.graph)
-        if self.loss is not None:
-            checked_loss(self.loss)
+        if checked_graph(self.graph) != "skeleton" and self.network not in GRAPH_NETWORKS:
+            raise GknetError(f"graph: {self.network} has none to choose; only {', '.join(GRAPH_NETWORKS)} have")
+        if self.loss is not None and checked_loss(self.loss) and self.network == "locator":
+            raise GknetError("loss: the locator has its own; leave it out")
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
         for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):
