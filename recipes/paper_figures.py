@@ -1,11 +1,12 @@
-"""Figure 2 of the paper (the keypoints of the three spacecraft, and the dataset) and figure 3 (detections by method).
+"""Figure 2 of the paper (the keypoints of the spacecraft, and the dataset), figure 3 (detections by method), and
+the README's picture (estimates of the shipped models).
 
     python recipes/paper_figures.py --out docs/images
     python recipes/paper_figures.py --out docs/images --work runs/paper --scale cpu     # figure 3 too
 
 Hardware   any
 Time       seconds
-Expected   keypoints.jpg from the bundled frames, and detections.jpg from the models that paper_tables.py exported
+Expected   keypoints.jpg and overlays.jpg from the bundled frames, and detections.jpg from the models that paper_tables.py exported
 """
 
 from __future__ import annotations
@@ -82,6 +83,19 @@ def keypoint_figure() -> ndarray:
     return sheet(rows)
 
 
+def overlay_figure(place: int = 4) -> ndarray:
+    """The frame at one place of each bundled sequence, with the estimate from the full image and the truth."""
+    row = []
+    for name in NAMES:
+        dataset = SkdDataset(bundled_frames(), None, name)
+        frame = dataset.frame(place)
+        estimate = load_estimator(name).estimate(frame.image, frame.camera)
+        near, close = zoomed(frame, estimate, oracle_crop(frame, dataset.spacecraft, SIDE))
+        drawn = draw_overlay(near, dataset.spacecraft, close, [name], legend=False, weight=1.3)
+        row.append(cv2.resize(drawn, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
+    return sheet([row])
+
+
 def detection_figure(work: Path, methods: dict[str, str], seed: int = 0) -> ndarray:
     """A row for each spacecraft, a column for each method: the frame of median difficulty for all of them together."""
     rows = []
@@ -120,6 +134,7 @@ def main() -> None:
     parser.add_argument("--scale", default="cpu", help="its sub-folder")
     arguments = parser.parse_args()
     write_jpeg(arguments.out / "keypoints.jpg", keypoint_figure())
+    write_jpeg(arguments.out / "overlays.jpg", overlay_figure())
     if arguments.work is not None:
         methods = FULL_METHODS if arguments.scale == "full" else METHODS
         write_jpeg(arguments.out / "detections.jpg", detection_figure(arguments.work / arguments.scale, methods))
