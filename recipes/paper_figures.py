@@ -6,7 +6,8 @@ the README's picture (estimates of the shipped models).
 
 Hardware   any
 Time       seconds
-Expected   keypoints.jpg and overlays.jpg from the bundled frames, and detections.jpg from the models that paper_tables.py exported
+Expected   keypoints.jpg and overlays.jpg from the bundled frames; detections.jpg from the models of
+           paper_tables.py
 """
 
 from __future__ import annotations
