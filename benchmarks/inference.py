@@ -26,9 +26,10 @@ from rich.table import Table
 from gknet.crop import Crop
 from gknet.decode import decode_heatmaps
 from gknet.errors import GknetError
-from gknet.estimator import Estimator, load_estimator, network_input
+from gknet.estimator import Estimator, load_estimator
 from gknet.frame import Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.locate import network_input
 from gknet.pnp import solve_pnp
 
 CAMERA = Camera.from_focal(1400, 1024, 1024)

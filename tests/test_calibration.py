@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gknet.calibration import BARE, Sight, calibrated, fit_decoding, sight
 from gknet.crop import Crop
 from gknet.errors import GknetError
-from gknet.estimator import Estimator, Looking
+from gknet.estimator import Estimator
 from gknet.frame import Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.metrics import nees

@@ -12,9 +12,10 @@ import pytest
 import gknet.estimator as estimating
 from gknet.decode import Decoding
 from gknet.errors import GknetError
-from gknet.estimator import Estimator, Looking, check_image, load_estimator, shipped_models
+from gknet.estimator import Estimator, load_estimator, shipped_models
 from gknet.frame import Box, Frame
 from gknet.geometry import Camera, Pose
+from gknet.locate import Looking, check_image
 from gknet.metrics import errors
 from gknet.pnp import PnpResult, PnpSettings
 from gknet.spacecraft import Spacecraft, spacecraft_toml

@@ -19,8 +19,9 @@ from scipy.stats import chi2
 from gknet.crop import Crop
 from gknet.decode import Decoding
 from gknet.errors import GknetError
-from gknet.estimator import Estimator, check_image
+from gknet.estimator import Estimator
 from gknet.frame import Box, Estimate, Frame, Keypoints
+from gknet.locate import check_image
 from gknet.metrics import nees
 
 FREEDOM = 4.0

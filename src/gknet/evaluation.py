@@ -15,8 +15,8 @@ from numpy import ndarray
 from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
-from gknet.estimator import Estimator
 from gknet.frame import Estimate, Frame, Keypoints
+from gknet.locate import CropEstimator
 from gknet.metrics import FrameErrors, Summary, errors, keypoint_errors_px, oracle_crop, summarise
 from gknet.source import Unreadable
 from gknet.spacecraft import Spacecraft
@@ -126,7 +126,7 @@ def keypoint_statistics(run: Run, k: int) -> KeypointStatistics:
 
 def evaluate(
     dataset: SkdDataset,
-    estimator: Estimator,
+    estimator: CropEstimator,
     protocols: Sequence[Protocol] = ("oracle", "detected"),
     data: str = "",
     on_frame: Callable[[], None] = lambda: None,
@@ -155,7 +155,7 @@ def evaluate(
     return Evaluation(estimator.spacecraft, data or str(dataset.root), runs, tuple(passed_over))
 
 
-def _case(index: int, frame: Frame, sequence: str, estimator: Estimator, protocol: Protocol) -> Case:
+def _case(index: int, frame: Frame, sequence: str, estimator: CropEstimator, protocol: Protocol) -> Case:
     spacecraft = estimator.spacecraft
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: an evaluation needs its image")

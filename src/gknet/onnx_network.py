@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float32
 from numpy import ndarray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from gknet.errors import GknetError
 from gknet.spacecraft import Spacecraft, spacecraft_from_toml
@@ -24,27 +24,35 @@ class Metadata(BaseModel):
     """What the export wrote under the key "gknet", as JSON.
 
     spacecraft        the text of the spacecraft's .toml: channel k of a keypoint network is its keypoint k
-    stride            input pixels per cell of the output
+    stride            input pixels per cell of the output's maps; a direct network has none
+    bins              of a direct network's attitude, each turn (direct.py)
     tolerance         the largest difference from the trained network that the export allowed
     floor_cells, spread_scale, pose_scale   how sure keypoints and poses are (calibration.py), from the validation split
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    kind: Literal["keypoints", "locator"]
+    kind: Literal["keypoints", "locator", "direct"]
     version: str
     network: str
     spacecraft: str
-    stride: int = Field(gt=0)
+    stride: int | None = Field(default=None, gt=0)
+    bins: int | None = Field(default=None, ge=4, multiple_of=2)
     input_size: int = Field(gt=0)
     tolerance: FiniteFloat
     floor_cells: FiniteFloat = Field(default=0.3, gt=0)
     spread_scale: FiniteFloat = Field(default=1.0, gt=0)
     pose_scale: FiniteFloat = Field(default=1.0, gt=0)
 
+    @model_validator(mode="after")
+    def _output_is_known(self) -> Metadata:
+        if (self.kind == "direct") != (self.bins is not None) or (self.kind == "direct") == (self.stride is not None):
+            raise ValueError("expected a stride for maps, or bins for a direct network")
+        return self
+
 
 class OnnxNetwork:
-    """A callable (b, 3, size, size) float32 RGB in [0, 1] -> (b, c, size / stride, size / stride).
+    """A callable (b, 3, size, size) float32 RGB in [0, 1] -> (b, c, size / stride, size / stride), or (b, c) if direct.
 
     threads   of one call; None leaves the choice to onnxruntime (every core)
     device    "cpu", or "cuda" with the package onnxruntime-gpu
@@ -61,7 +69,7 @@ class OnnxNetwork:
     def spacecraft(self) -> Spacecraft:
         return spacecraft_from_toml(self.metadata.spacecraft, str(self.path))
 
-    def __call__(self, images: Float32[ndarray, "b 3 size size"]) -> Float32[ndarray, "b c cells cells"]:
+    def __call__(self, images: Float32[ndarray, "b 3 size size"]) -> Float32[ndarray, "b c *cells"]:
         size = self.metadata.input_size
         if images.ndim != 4 or images.shape[1:] != (3, size, size) or images.dtype != np.float32:
             raise GknetError(

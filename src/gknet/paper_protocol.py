@@ -14,9 +14,9 @@ from numpy import ndarray
 
 from gknet.crop import Crop
 from gknet.errors import GknetError
-from gknet.estimator import Network, check_image, network_input
 from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.locate import Network, check_image, network_input
 from gknet.spacecraft import Spacecraft
 
 STRIDE = 8

@@ -12,7 +12,7 @@ from gknet.cli import doctor
 from gknet.cli.doctor import Finding, State
 from gknet.cli.main import run
 from gknet.errors import GknetError
-from gknet.estimator import Looking
+from gknet.locate import Looking
 from gknet.spacecraft import Spacecraft
 from tests.cli.toy import toy_spacecraft
 

@@ -20,6 +20,8 @@ from gknet.training.cache import build_cache, cached_row, craft_window  # noqa: 
 from gknet.training.schedule import Stage  # noqa: E402
 from tests.training.toy import POINTS, drawn, toy_spacecraft, write_toy  # noqa: E402
 
+CRAFT = toy_spacecraft()
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -36,7 +38,7 @@ def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 5
 
 def test_a_cached_row_is_the_frame_through_a_crop() -> None:
     frame = a_frame((0.3, -0.2, 30.0))
-    row = cached_row(frame, POINTS, "craft", 160)
+    row = cached_row(frame, CRAFT, "craft", 160)
     box = frame.true_box(POINTS)
     assert row is not None
     assert box is not None
@@ -58,7 +60,7 @@ def test_a_window_around_the_craft_is_taken_whole() -> None:
 
 def test_truncation_masks_and_never_renumbers() -> None:
     frame = a_frame((3.0, 0.5, 12.0))
-    row = cached_row(frame, POINTS, "craft", 160)
+    row = cached_row(frame, CRAFT, "craft", 160)
     assert row is not None
     truth = frame.keypoints_px(POINTS)
     inside = frame.camera.contains(truth)
@@ -68,9 +70,9 @@ def test_truncation_masks_and_never_renumbers() -> None:
 
 
 def test_frames_without_the_craft_are_no_rows() -> None:
-    assert cached_row(a_frame((40.0, 0.0, 12.0)), POINTS, "craft", 64) is None
+    assert cached_row(a_frame((40.0, 0.0, 12.0)), CRAFT, "craft", 64) is None
     behind = replace(a_frame(), cam_from_body=Pose(np.eye(3), np.array([0, 0, -20.0])))
-    assert cached_row(behind, POINTS, "craft", 64) is None
+    assert cached_row(behind, CRAFT, "craft", 64) is None
 
 
 class Frames:
@@ -93,28 +95,28 @@ class Frames:
 def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: Path) -> None:
     frames = Frames([a_frame((0.2 * k, 0, 12), 128) for k in range(5)], bad=1)
     said: list[str] = []
-    cache = build_cache(frames, POINTS, tmp_path, 64, report=said.append)
+    cache = build_cache(frames, CRAFT, tmp_path, 64, report=said.append)
     assert len(cache) == 4
     assert said == ["left out: frame 1: truncated"]
-    again = build_cache(frames, POINTS, tmp_path, 64)
+    again = build_cache(frames, CRAFT, tmp_path, 64)
     assert frames.reads == 5
     np.testing.assert_array_equal(again.images, cache.images)
     frames.frames[0] = a_frame((0.0, 0.1, 12), 128)
-    assert not np.array_equal(build_cache(frames, POINTS, tmp_path, 64).points_px[0], cache.points_px[0])
+    assert not np.array_equal(build_cache(frames, CRAFT, tmp_path, 64).points_px[0], cache.points_px[0])
     assert not list(tmp_path.glob("*.tmp"))
 
 
 def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
     for frames in ([], [a_frame((40.0, 0.0, 12.0), 64)]):
         with pytest.raises(GknetError, match="cache"):
-            build_cache(Frames(frames), POINTS, tmp_path, 64)
+            build_cache(Frames(frames), CRAFT, tmp_path, 64)
     assert not list(tmp_path.glob("*"))
 
 
 def loader(folder: Path, draw=draw_keypoints, **options: int) -> Loader:
     data = SkdDataset(folder, "train", "satellite_01")
     window = "picture" if draw is draw_box else "craft"
-    return Loader(build_cache(data, data.spacecraft.points_m, folder / "cache", 96, window), draw, 7, **options)
+    return Loader(build_cache(data, data.spacecraft, folder / "cache", 96, window), draw, 7, **options)
 
 
 def test_an_epoch_shows_every_row_once(folder: Path) -> None:

@@ -10,8 +10,8 @@ import typer
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
-    from gknet.estimator import Estimator
     from gknet.evaluation import Evaluation
+    from gknet.locate import CropEstimator
     from gknet.report.page import Section
     from gknet.source import SkdDataset
 
@@ -61,7 +61,7 @@ def bundled_frames() -> Path:
     return folder
 
 
-def show(dataset: SkdDataset, estimator: Estimator, out: Path) -> tuple[Section, list[Path]]:
+def show(dataset: SkdDataset, estimator: CropEstimator, out: Path) -> tuple[Section, list[Path]]:
     """Evaluate one spacecraft, and write its poses, overlays and video of the last protocol."""
     from gknet.cli.evaluate import evaluate_section
     from gknet.prediction import PredictionFiles

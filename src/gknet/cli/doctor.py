@@ -127,11 +127,15 @@ def _try_model(name: str) -> str:
 
     import numpy as np
 
+    from gknet.direct import DirectEstimator
     from gknet.estimator import load_estimator
 
     estimator = load_estimator(name)
     looking = estimator.looking
-    expected = {"keypoints": (estimator.keypoint_network, looking.input_size, estimator.spacecraft.keypoint_count)}
+    if isinstance(estimator, DirectEstimator):
+        expected = {"direct": (estimator.network, looking.input_size, 3 + estimator.bins.count)}
+    else:
+        expected = {"keypoints": (estimator.keypoint_network, looking.input_size, estimator.spacecraft.keypoint_count)}
     if estimator.locator is not None:
         expected["locator"] = (estimator.locator, looking.locator_size, 5)
     words = []
@@ -141,11 +145,12 @@ def _try_model(name: str) -> str:
         start = time.perf_counter()
         second = network(image)
         milliseconds = 1000 * (time.perf_counter() - start)
-        if first.ndim != 4 or first.shape[:2] != (1, channels) or not np.isfinite(first).all():
-            raise GknetError(f"{kind}: expected {channels} finite maps, got shape {first.shape}")
+        dimensions, what = (2, "numbers") if kind == "direct" else (4, "maps")
+        if first.ndim != dimensions or first.shape[:2] != (1, channels) or not np.isfinite(first).all():
+            raise GknetError(f"{kind}: expected {channels} finite {what}, got shape {first.shape}")
         if not np.allclose(first, second, atol=1e-5):
             raise GknetError(f"{kind}: the same input gave two answers")
-        words.append(f"{kind} {channels} x {first.shape[2]} x {first.shape[3]} in {milliseconds:.1f} ms")
+        words.append(f"{kind} {' x '.join(map(str, first.shape[1:]))} in {milliseconds:.1f} ms")
     return ", ".join(words)
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from gknet.estimator import Estimator
     from gknet.evaluation import Evaluation
+    from gknet.locate import CropEstimator
     from gknet.report.page import Section
     from gknet.source import SkdDataset
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 def evaluate(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="An SKD dataset folder.")],
     spacecraft: Annotated[str | None, typer.Option(help="A shipped model: satellite_01, satellite_02, ...")] = None,
-    model: Annotated[Path | None, typer.Option(help="A folder with keypoints.onnx and locator.onnx.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A folder with keypoints.onnx (or direct.onnx), locator.onnx.")
+    ] = None,
     split: Annotated[str, typer.Option(help="train, val, test, or all.")] = "test",
     every: Annotated[int, typer.Option(help="Take each n-th frame of a sequence.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for metrics.json and report.html.")] = Path("evaluation"),
@@ -44,7 +46,7 @@ def evaluate(
         typer.echo(f"wrote {path}")
 
 
-def evaluate_section(dataset: SkdDataset, estimator: Estimator, words: str, pictures: int) -> Section:
+def evaluate_section(dataset: SkdDataset, estimator: CropEstimator, words: str, pictures: int) -> Section:
     """Evaluate with a progress bar, with the pictures for the page. Without a locator only the oracle's crop is run."""
     from gknet.evaluation import PROTOCOL_WORDS, evaluate
     from gknet.progress import progress

@@ -12,8 +12,8 @@ from gknet.errors import GknetError
 
 if TYPE_CHECKING:
     from gknet.camera_file import Lens
-    from gknet.estimator import Estimator
     from gknet.frame import Box
+    from gknet.locate import CropEstimator
     from gknet.prediction import PredictionFiles
     from gknet.source import Source
 
@@ -28,7 +28,9 @@ class PoseLayout(StrEnum):
 def predict(
     input_path: Annotated[Path, typer.Argument(metavar="INPUT", help="Image, folder of images, video or SKD dataset.")],
     spacecraft: Annotated[str | None, typer.Option(help="A shipped model: satellite_01, satellite_02, ...")] = None,
-    model: Annotated[Path | None, typer.Option(help="A folder with keypoints.onnx (and locator.onnx).")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A folder with keypoints.onnx (or direct.onnx), locator.onnx.")
+    ] = None,
     camera: Annotated[Path | None, typer.Option(help="Camera file: ours, SPEED+'s camera.json, or a 3x3 text.")] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of a centred camera.")] = None,
     hfov_deg: Annotated[float | None, typer.Option(help="Horizontal field of view of a centred camera.")] = None,
@@ -85,7 +87,7 @@ def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | N
     return FieldOfView(focal_px, None if hfov_deg is None else radians(hfov_deg))
 
 
-def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | None) -> Estimator:
+def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | None) -> CropEstimator:
     """The shipped model of a spacecraft, or a user's folder."""
     from gknet.estimator import load_estimator
 
@@ -97,7 +99,7 @@ def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | 
 
 
 def predict_all(
-    source: Source, estimator: Estimator, files: PredictionFiles, box: Box | None = None, oracle: bool = False
+    source: Source, estimator: CropEstimator, files: PredictionFiles, box: Box | None = None, oracle: bool = False
 ) -> None:
     """Every picture of the source into the files; one that cannot be read is recorded and passed over."""
     from gknet.progress import progress

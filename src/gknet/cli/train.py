@@ -13,7 +13,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
     spacecraft: Annotated[str, typer.Option(help="Which spacecraft of the dataset.")],
     network: Annotated[
-        str, typer.Option(help="gknet-s, hrnet-s, resunet-s, gknet-paper, hrnet, resunet or locator.")
+        str, typer.Option(help="gknet-s, hrnet-s, resunet-s, dmanet-s, gknet-paper, hrnet, resunet, dmanet or locator.")
     ] = "gknet-s",
     graph: Annotated[
         str, typer.Option(help="skeleton, identity (no edges), random (as many) or none (no graph branch).")
@@ -66,7 +66,7 @@ def train(
 
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
-    out: Annotated[Path, typer.Option(help="Folder for keypoints.onnx or locator.onnx, and the weights.")],
+    out: Annotated[Path, typer.Option(help="Folder for keypoints.onnx, direct.onnx or locator.onnx, and the weights.")],
     tolerance: Annotated[
         float | None, typer.Option(help="Largest difference from torch, in units of the output.")
     ] = None,

@@ -49,11 +49,13 @@ def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c hei
 
 
 class ConvNorm(nn.Module):
-    """Convolution, batch normalisation and, unless `relu` is False, a ReLU."""
+    """Convolution, batch normalisation and, unless `relu` is False, a ReLU. `groups` = `inputs` is depthwise."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, relu: bool = True) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, relu: bool = True, groups: int = 1
+    ) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
         self.norm: nn.Module = nn.BatchNorm2d(outputs)
         self.relu = relu
 

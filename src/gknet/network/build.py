@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from numpy import ndarray
 
 from gknet.errors import GknetError
+from gknet.network.dmanet import DMANet, DMANetConfig
 from gknet.network.gknet import GKNet, GKNetConfig
 from gknet.network.gknet_paper import GKNetPaper, GKNetPaperConfig
 from gknet.network.heatmap import HeatmapNetwork
@@ -17,15 +18,17 @@ from gknet.network.hrnet import HRNet, HRNetConfig
 from gknet.network.locator import Locator, LocatorConfig
 from gknet.network.resunet import ResUNet, ResUNetConfig
 
-Network = HeatmapNetwork | Locator
-NETWORKS = ("gknet-s", "gknet-paper", "hrnet", "hrnet-s", "resunet", "resunet-s", "locator")
+Network = HeatmapNetwork | DMANet | Locator
+NETWORKS = ("gknet-s", "gknet-paper", "hrnet", "hrnet-s", "resunet", "resunet-s", "dmanet", "dmanet-s", "locator")
 GRAPH_NETWORKS = ("gknet-s", "gknet-paper")
 """Those that have a graph to choose."""
+OWN_LOSS_NETWORKS = ("dmanet", "dmanet-s", "locator")
+"""Those that have no heatmaps, and a loss of their own."""
 
 PAPER_STRIDE = 8
 """The paper holds every method to heatmaps of 32x32 at 256x256."""
 
-Config = TypeVar("Config", GKNetConfig, GKNetPaperConfig, HRNetConfig, ResUNetConfig, LocatorConfig)
+Config = TypeVar("Config", GKNetConfig, GKNetPaperConfig, HRNetConfig, ResUNetConfig, DMANetConfig, LocatorConfig)
 
 
 def configured(config: type[Config], values: Mapping[str, object]) -> Config:
@@ -76,6 +79,16 @@ def resunet_s(keypoints: int, loss: str = "likelihood") -> ResUNet:
     return ResUNet(ResUNetConfig(width=22, blocks=(3, 4, 6, 3)), keypoints, loss)
 
 
+def dmanet() -> DMANet:
+    """27.7 M parameters and 4.2 GMAC, about the encoder of other direct methods (ResNet-50); its own are not known."""
+    return DMANet(DMANetConfig((64, 128, 256, 512), (64, 128, 256, 384), (3, 4, 6, 3), head=1024))
+
+
+def dmanet_s() -> DMANet:
+    """DMANet's shape at the cost of gknet-s."""
+    return DMANet(DMANetConfig((40, 80, 160, 320), (20, 32, 64, 128), (2, 3, 5, 4), head=384))
+
+
 def locator() -> Locator:
     """0.7 M parameters, the whole picture at 256x256 -> 64x64 cells."""
     return Locator(LocatorConfig(width=16, pyramid_width=32))
@@ -87,7 +100,7 @@ def default_loss(name: str) -> str:
 
 
 def build(name: str, adjacency: Bool[ndarray, "n n"], graph: str = "skeleton", loss: str | None = None) -> Network:
-    """The network called `name`; `loss` None is its own. Only GKNet has a use for the graph."""
+    """The network called `name`; `loss` None is its own. Only GKNet has a use for the graph, heatmaps for the loss."""
     loss = default_loss(name) if loss is None else loss
     match name:
         case "gknet-s":
@@ -102,6 +115,10 @@ def build(name: str, adjacency: Bool[ndarray, "n n"], graph: str = "skeleton", l
             return resunet(len(adjacency), loss)
         case "resunet-s":
             return resunet_s(len(adjacency), loss)
+        case "dmanet":
+            return dmanet()
+        case "dmanet-s":
+            return dmanet_s()
         case "locator":
             return locator()
     raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{name}'")

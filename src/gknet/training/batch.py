@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from gknet.direct import CropPose
 from gknet.training.augment import (
     Augmentation,
     PictureAugmentation,
@@ -31,14 +32,16 @@ AHEAD = 3
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A network's input and the points to be found in it, in input pixels.
+    """A network's input and what is to be found in it: points in input pixels, and the pose.
 
     image (s, s, 3) uint8; points_px (k, 2); weight (k,) 1 where the point counts, 0 where it is out of view
+    pose (7,) as the input shows it, `CropPose.vector`; NaN where it has none to show
     """
 
     image: UInt8[ndarray, "s s 3"]
     points_px: Float[ndarray, "k 2"]
     weight: Float[ndarray, "k"]
+    pose: Float[ndarray, "7"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,7 @@ class Batch:
     image: UInt8[Tensor, "b s s 3"]
     points_px: Float[Tensor, "b k 2"]
     weight: Float[Tensor, "b k"]
+    pose: Float[Tensor, "b 7"]
     position: int
 
     def __len__(self) -> int:
@@ -73,7 +77,8 @@ def draw_keypoints(rng: np.random.Generator, cache: Cache, row: int, size: int) 
     image = photometric(rng, warp_image(cache.images[row], matrix, size), ranges)
     warped = warp_points(matrix, points)
     seen = in_view & points_inside(warped, size)
-    return Sample(image, np.where(seen[:, None], warped, 0.0).astype(np.float32), seen.astype(np.float32))
+    points_px = np.where(seen[:, None], warped, 0.0).astype(np.float32)
+    return Sample(image, points_px, seen.astype(np.float32), _warped_pose(cache, row, matrix, size))
 
 
 def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
@@ -83,7 +88,13 @@ def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sam
     corners = warp_points(matrix, cache.boxes_px[row].astype(np.float64).reshape(2, 2)).clip(0, size)
     low, high = corners.min(axis=0), corners.max(axis=0)
     seen = float((high - low).min() > size / 64)
-    return Sample(image, np.stack([low, high]).astype(np.float32), np.full(2, seen, dtype=np.float32))
+    points_px, weight = np.stack([low, high]).astype(np.float32), np.full(2, seen, dtype=np.float32)
+    return Sample(image, points_px, weight, _warped_pose(cache, row, matrix, size))
+
+
+def _warped_pose(cache: Cache, row: int, matrix: Float[ndarray, "3 3"], size: int) -> Float[ndarray, "7"]:
+    pose = CropPose.from_vector(cache.poses[row].astype(np.float64))
+    return pose.warped(matrix, cache.size, size).vector.astype(np.float32)
 
 
 def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, "n"]:
@@ -117,6 +128,7 @@ class Loader:
             torch.from_numpy(np.stack([sample.image for sample in samples])),
             torch.from_numpy(np.stack([sample.points_px for sample in samples])),
             torch.from_numpy(np.stack([sample.weight for sample in samples])),
+            torch.from_numpy(np.stack([sample.pose for sample in samples])),
             position + stage.batch * self.world,
         )
 

@@ -16,8 +16,10 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from gknet.crop import Crop
+from gknet.direct import CropPose
 from gknet.errors import GknetError
 from gknet.frame import Box, Frame
+from gknet.spacecraft import Spacecraft
 
 MARGIN = 1.6
 """A cached crop's side over the longer side of the keypoints' box: room to turn and to shift."""
@@ -25,7 +27,7 @@ MARGIN = 1.6
 WHOLE = 0.8
 """A crop that would cover this share of the picture's side takes the whole picture instead."""
 
-LAYOUT = 1
+LAYOUT = 2
 
 Window = Literal["craft", "picture"]
 
@@ -46,12 +48,14 @@ class Cache:
     points_px (m, n, 2) the projected keypoints; NaN behind the camera
     in_view   (m, n) the keypoint is inside the picture and inside the crop, hidden or not
     boxes_px  (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the picture
+    poses     (m, 7) the true pose as the crop shows it, `CropPose.vector`; NaN where the origin is behind the camera
     """
 
     images: UInt8[ndarray, "m s s 3"]
     points_px: Float[ndarray, "m n 2"]
     in_view: Bool[ndarray, "m n"]
     boxes_px: Float[ndarray, "m 4"]
+    poses: Float[ndarray, "m 7"]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -75,10 +79,10 @@ def craft_window(frame: Frame, box: Box, size: int) -> Crop:
     return whole if around.side >= WHOLE * whole.side else around
 
 
-def _label_key(frames: FrameSource, points_m: Float[ndarray, "n 3"], window: Window, size: int, stamp: str) -> str:
+def _label_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size: int, stamp: str) -> str:
     """A name for the cache that changes with anything that it was made of."""
     digest = hashlib.sha256(f"{LAYOUT} {window} {size} {MARGIN} {WHOLE} {stamp}".encode())
-    digest.update(np.ascontiguousarray(points_m).tobytes())
+    digest.update(np.append(spacecraft.points_m, spacecraft.diameter_m).tobytes())
     for i in range(len(frames)):
         frame = frames.frame(i, image=False)
         digest.update(f"{frame.name} {frame.camera.width} {frame.camera.height}".encode())
@@ -94,11 +98,13 @@ class _Row:
     points_px: Float[ndarray, "n 2"]
     in_view: Bool[ndarray, "n"]
     box_px: Float[ndarray, "4"]
+    pose: Float[ndarray, "7"]
 
 
-def cached_row(frame: Frame, points_m: Float[ndarray, "n 3"], window: Window, size: int) -> _Row | None:
+def cached_row(frame: Frame, spacecraft: Spacecraft, window: Window, size: int) -> _Row | None:
     """One frame as the cache keeps it; None when nothing of the craft is in the picture."""
     assert frame.image is not None
+    points_m = spacecraft.points_m
     pixels = frame.keypoints_px(points_m)
     inside = frame.camera.contains(pixels)
     box = frame.true_box(points_m) if np.isfinite(pixels).any() else None
@@ -108,12 +114,15 @@ def cached_row(frame: Frame, points_m: Float[ndarray, "n 3"], window: Window, si
     points = crop.to_input(pixels)
     inside = inside & ((points >= 0) & (points <= size)).all(axis=1)
     corners = crop.to_input(np.array([[box.x0, box.y0], [box.x1, box.y1]]))
-    return _Row(crop.cut(frame.image), points, inside, corners.ravel())
+    assert frame.cam_from_body is not None
+    pose = CropPose.of(frame.cam_from_body, frame.camera, crop, spacecraft.diameter_m)
+    vector = np.full(7, np.nan) if pose is None else pose.vector
+    return _Row(crop.cut(frame.image), points, inside, corners.ravel(), vector)
 
 
 def build_cache(
     frames: FrameSource,
-    points_m: Float[ndarray, "n 3"],
+    spacecraft: Spacecraft,
     folder: Path,
     size: int,
     window: Window = "craft",
@@ -129,18 +138,18 @@ def build_cache(
     """
     if len(frames) == 0:
         raise GknetError("cache: the dataset has no frames for this split and spacecraft")
-    place = folder / _label_key(frames, points_m, window, size, stamp)
+    place = folder / _label_key(frames, spacecraft, window, size, stamp)
     if not (place / "labels.npz").exists():
-        _write_cache(frames, points_m, place, size, window, workers, advance, report)
+        _write_cache(frames, spacecraft, place, size, window, workers, advance, report)
     labels = np.load(place / "labels.npz")
     count = len(labels["points_px"])
     images = np.memmap(place / "images.u8", dtype=np.uint8, mode="r", shape=(count, size, size, 3))
-    return Cache(images, labels["points_px"], labels["in_view"], labels["boxes_px"])
+    return Cache(images, labels["points_px"], labels["in_view"], labels["boxes_px"], labels["poses"])
 
 
 def _write_cache(
     frames: FrameSource,
-    points_m: Float[ndarray, "n 3"],
+    spacecraft: Spacecraft,
     place: Path,
     size: int,
     window: Window,
@@ -153,11 +162,11 @@ def _write_cache(
 
     def row(i: int) -> _Row | str | None:
         try:
-            return cached_row(frames.frame(i), points_m, window, size)
+            return cached_row(frames.frame(i), spacecraft, window, size)
         except GknetError as error:
             return str(error)
 
-    kept: list[tuple[ndarray, ndarray, ndarray]] = []
+    kept: list[tuple[ndarray, ...]] = []
     try:
         with ThreadPoolExecutor(workers) as pool, open(temporary / "images.u8", "wb") as images:
             for start in range(0, len(frames), 256):  # in order and bounded in memory
@@ -166,16 +175,17 @@ def _write_cache(
                         report(f"left out: {item}")
                     elif item is not None:
                         images.write(item.image.tobytes())
-                        kept.append((item.points_px, item.in_view, item.box_px))
+                        kept.append((item.points_px, item.in_view, item.box_px, item.pose))
                     advance(done, len(frames))
         if not kept:
             raise GknetError("cache: no frame shows the spacecraft; is this the right dataset?")
-        points, in_view, boxes = (np.stack(column) for column in zip(*kept, strict=True))
+        points, in_view, boxes, poses = (np.stack(column) for column in zip(*kept, strict=True))
         np.savez(
             temporary / "labels.npz",
             points_px=points.astype(np.float32),
             in_view=in_view,
             boxes_px=boxes.astype(np.float32),
+            poses=poses.astype(np.float32),
         )
         if place.exists():  # another process was faster
             return

@@ -27,13 +27,15 @@ from gknet.atomic import write_bytes
 from gknet.errors import GknetError
 from gknet.network.backbone import ConvNorm
 from gknet.network.build import Network, build
+from gknet.network.dmanet import DMANet
+from gknet.network.locator import Locator
 from gknet.onnx_network import METADATA_KEY
 from gknet.spacecraft import spacecraft_from_toml
 from gknet.training.checkpoint import BEST, load_weights, save_weights
 from gknet.training.settings import Run, load_run
 
 TOLERANCE = 1e-3
-"""Largest difference between torch and onnxruntime, in units of a heatmap (its peak is 1)."""
+"""Largest difference between torch and onnxruntime: of a heatmap (its peak is 1), of a belief, of a crop's side."""
 
 ROUNDING = 0.05
 """Largest difference that storing the weights in 16 bits may make, in the same units."""
@@ -146,17 +148,23 @@ def run_torch(network: Network, images: Float32[ndarray, "b 3 s s"]) -> ndarray:
     return network(torch.from_numpy(images)).float().numpy()
 
 
+def shape_of_output(network: Network) -> dict[str, object]:
+    """The kind of a network, and what tells its output's shape."""
+    if isinstance(network, DMANet):
+        return {"kind": "direct", "bins": network.config.bins}
+    return {"kind": "locator" if isinstance(network, Locator) else "keypoints", "stride": network.stride}
+
+
 def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:
     """What the runtime must know to use the file."""
     best = run.best or {}
     return {
-        "kind": "locator" if run.network == "locator" else "keypoints",
+        **shape_of_output(network),
         "version": run.version,
         "network": run.network,
         "graph": run.graph,
         "loss": run.loss,
         "spacecraft": run.spacecraft_toml,
-        "stride": network.stride,
         "input_size": run.input_size,
         "tolerance": tolerance,
         **{name: best[name] for name in ("floor_cells", "spread_scale", "pose_scale") if name in best},

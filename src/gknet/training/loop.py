@@ -32,7 +32,7 @@ from gknet.training.checkpoint import (
 from gknet.training.progress import Teller
 from gknet.training.schedule import Budget, learning_rate, stage_at
 from gknet.training.settings import Run, TrainSettings
-from gknet.training.setup import make_fabric, make_optimizer, make_task, open_cache, update_average
+from gknet.training.setup import check_cameras, make_fabric, make_optimizer, make_task, open_cache, update_average
 from gknet.training.validation import validation_rows
 
 REPORT_STEPS = 50
@@ -75,6 +75,7 @@ def train(
     if settings.init is not None and not resume:
         taken, total = warm_start(network, settings.init)
         fabric.print(f"{settings.init}: {taken} of {total} tensors taken")
+    check_cameras(network, training_data)
     task = make_task(network, spacecraft, settings)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network).to(fabric.device).eval()

@@ -7,9 +7,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from gknet.network.dmanet import Branches
 from gknet.network.heatmap import log_belief
 
 TINY = 1e-12
+
+OFFSET_WEIGHT, DEPTH_WEIGHT = 10.0, 5.0
+"""Of the offset and the depth in a direct network's loss: at the start they count about as much as the attitude."""
+SMOOTH = 0.02
+"""Where the smooth L1 of offset (sides of the crop) and log_depth turns from square to linear."""
 
 CENTRE_WEIGHT = 0.1
 """Of the centre's map in the locator's loss. Its cross-entropy, summed over the cells, would drown the box's part."""
@@ -50,6 +56,21 @@ def likelihood_loss(
     wanted = wanted / wanted.sum(dim=2, keepdim=True).clamp(min=TINY)
     divergence = (wanted * (wanted.clamp(min=TINY).log() - log_belief(maps))).sum(dim=2)
     return (divergence * weight).sum() / weight.sum().clamp(min=1)
+
+
+def direct_loss(
+    branches: Branches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, "b"]
+) -> Float[Tensor, ""]:
+    """Smooth L1 of the offset and of log_depth, and the divergence of the attitude's belief from its soft label.
+
+    0 at best. pose: `CropPose.vector`, finite; label: `AttitudeBins.soft_label`; weight: 0 where there is no pose.
+    """
+    offset = functional.smooth_l1_loss(branches.offset, pose[:, :2], beta=SMOOTH, reduction="none").sum(dim=1)
+    depth = functional.smooth_l1_loss(branches.log_depth, pose[:, 2], beta=SMOOTH, reduction="none")
+    belief = branches.attitude.log_softmax(dim=1)
+    divergence = (label * (label.clamp(min=TINY).log() - belief)).sum(dim=1)
+    loss = OFFSET_WEIGHT * offset + DEPTH_WEIGHT * depth + divergence
+    return (loss * weight).sum() / weight.sum().clamp(min=1)
 
 
 def box_iou(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gknet.atomic import write_text
 from gknet.errors import GknetError
-from gknet.network.build import GRAPH_NETWORKS, NETWORKS, default_loss
+from gknet.network.build import GRAPH_NETWORKS, NETWORKS, OWN_LOSS_NETWORKS, default_loss
 from gknet.network.graph import checked_graph
 from gknet.network.heatmap import checked_loss
 from gknet.training.cache import Window
@@ -20,6 +20,7 @@ STAGES = {
     "gknet-paper": PAPER_STAGES,
     "hrnet": PAPER_STAGES,
     "resunet": PAPER_STAGES,
+    "dmanet": PAPER_STAGES,
     "locator": (Stage(0.4, 128, 32), Stage(0.6, 256, 32)),
 }
 """Small pictures first: most of what there is to learn is seen there, at a quarter of the cost."""
@@ -71,8 +72,8 @@ class TrainSettings:
             raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{self.network}'")
         if checked_graph(self.graph) != "skeleton" and self.network not in GRAPH_NETWORKS:
             raise GknetError(f"graph: {self.network} has none to choose; only {', '.join(GRAPH_NETWORKS)} have")
-        if self.loss is not None and checked_loss(self.loss) and self.network == "locator":
-            raise GknetError("loss: the locator has its own; leave it out")
+        if self.loss is not None and checked_loss(self.loss) and self.network in OWN_LOSS_NETWORKS:
+            raise GknetError(f"loss: {self.network} has its own; leave it out")
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
         for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):

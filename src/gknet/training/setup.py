@@ -10,18 +10,22 @@ from lightning_fabric import Fabric
 from torch import nn
 
 from gknet.dataset.skd import SkdDataset
+from gknet.direct import AttitudeBins
 from gknet.errors import GknetError
 from gknet.network.build import Network
+from gknet.network.dmanet import DMANet
 from gknet.network.locator import Locator
 from gknet.spacecraft import Spacecraft
-from gknet.training.cache import Cache, build_cache
+from gknet.training.cache import Cache, FrameSource, build_cache
 from gknet.training.settings import TrainSettings
-from gknet.training.tasks import KeypointTask, LocatorTask, Task
+from gknet.training.tasks import DirectTask, KeypointTask, LocatorTask, Task
 from gknet.training.validation import validation_rows
 
 BF16_FLAGS = {"avx512_bf16", "amx_bf16"}
 PICTURE_SIZE = 256
 """Side of a cached whole picture: the locator's input."""
+SQUARE = 0.01
+"""How far fx / fy may be from 1 where pictures are turned."""
 STAMPED = 64
 """So many image files, evenly spread, tell by size and time whether the pictures are still the same."""
 
@@ -62,7 +66,22 @@ def make_fabric(settings: TrainSettings) -> Fabric:
 def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings) -> Task:
     if isinstance(network, Locator):
         return LocatorTask(spacecraft, network.stride, settings.input_size)
+    if isinstance(network, DMANet):
+        return DirectTask(spacecraft, AttitudeBins(network.config.bins), settings.input_size)
     return KeypointTask(spacecraft, settings.input_size, settings.auxiliary)
+
+
+def check_cameras(network: Network, frames: FrameSource) -> None:
+    """Refuse pixels that are not square to a direct network: turned, their picture is of no rolled camera."""
+    if not isinstance(network, DMANet):
+        return
+    for i in range(len(frames)):
+        frame = frames.frame(i, image=False)
+        ratio = frame.camera.matrix[0, 0] / frame.camera.matrix[1, 1]
+        if abs(ratio - 1) > SQUARE:
+            raise GknetError(
+                f"{frame.name}: expected square pixels, got fx / fy of {ratio:.3f}; resize the pictures to train on"
+            )
 
 
 def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
@@ -95,7 +114,7 @@ def open_cache(data: SkdDataset, settings: TrainSettings, folder: Path, say: Cal
         task = bar.add_task("decoding", total=len(data))
         return build_cache(
             data,
-            data.spacecraft.points_m,
+            data.spacecraft,
             folder,
             size,
             settings.window,

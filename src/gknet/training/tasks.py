@@ -1,4 +1,4 @@
-"""What is trained: keypoints or the locator. A task draws samples, computes the loss and validates."""
+"""What is trained: keypoints, a direct pose or the locator. A task draws samples, computes the loss and validates."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gknet.direct import AttitudeBins
 from gknet.frame import Frame
+from gknet.network.dmanet import DMANet
 from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
-from gknet.training.loss import gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
-from gknet.training.validation import Validation, validate_keypoints, validate_locator
+from gknet.training.loss import direct_loss, gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
+from gknet.training.validation import Validation, validate_direct, validate_keypoints, validate_locator
 
 LOSSES = {"likelihood": likelihood_loss, "squared": heatmap_loss}
 
@@ -57,6 +59,28 @@ class KeypointTask:
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
     ) -> Validation:
         return validate_keypoints(cast(HeatmapNetwork, network), device, frames, rows, self.spacecraft, self.input_size)
+
+
+@dataclass(frozen=True)
+class DirectTask:
+    """Offset, depth and attitude against the true pose as the crop shows it."""
+
+    spacecraft: Spacecraft
+    bins: AttitudeBins
+    input_size: int
+    draw: Draw = draw_keypoints
+
+    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
+        branches = cast(DMANet, network).branches(batch.network_input(device))
+        known = batch.pose.isfinite().all(dim=1)
+        pose = torch.where(known[:, None], batch.pose, 0.0)
+        label = torch.from_numpy(self.bins.soft_label(pose[:, 3:].numpy())).float()
+        return direct_loss(branches, pose.to(device), label.to(device), known.float().to(device))
+
+    def validate(
+        self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
+    ) -> Validation:
+        return validate_direct(network, device, frames, rows, self.spacecraft, self.bins, self.input_size)
 
 
 @dataclass(frozen=True)

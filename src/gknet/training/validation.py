@@ -14,9 +14,11 @@ from torch import nn
 from gknet import metrics
 from gknet.calibration import BARE, calibrated, sight
 from gknet.decode import Decoding
+from gknet.direct import AttitudeBins, DirectEstimator
 from gknet.errors import GknetError
-from gknet.estimator import Estimator, Looking
+from gknet.estimator import Estimator
 from gknet.frame import Frame
+from gknet.locate import Looking
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 
@@ -32,7 +34,7 @@ class Validation:
 def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray], ndarray]:
     """A torch network as the estimator sees networks: numpy in, numpy out, in float32."""
 
-    def run(images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "b c h w"]:
+    def run(images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "b c *cells"]:
         with torch.inference_mode():
             batch = torch.from_numpy(images).to(device).contiguous(memory_format=torch.channels_last)
             return network(batch).float().cpu().numpy()
@@ -78,17 +80,44 @@ def validate_keypoints(
     except GknetError:  # nothing was sure enough yet
         estimator = replace(bare, decoding=Decoding())
     errors = [metrics.errors(s.frame, s.estimate(estimator), spacecraft) for s in sights]
-    values = {
+    values = _means(errors) | {
+        "floor_cells": estimator.decoding.floor_cells,
+        "spread_scale": estimator.decoding.spread_scale,
+        "pose_scale": estimator.pnp.covariance_scale,
+    }
+    return Validation(values["rmse_px"], values)
+
+
+def _means(errors: Sequence[metrics.FrameErrors]) -> dict[str, float]:
+    return {
         "rmse_px": float(np.mean([error.rmse_px for error in errors])),
         "median_px": float(np.median([error.rmse_px for error in errors])),
         "pck_5": float(np.mean([error.pck_5 for error in errors])),
         "e_t": float(np.mean([error.e_t for error in errors])),
         "e_q_rad": float(np.mean([error.e_q_rad for error in errors])),
         "failures": float(np.mean([error.failure is not None for error in errors])),
-        "floor_cells": estimator.decoding.floor_cells,
-        "spread_scale": estimator.decoding.spread_scale,
-        "pose_scale": estimator.pnp.covariance_scale,
     }
+
+
+def validate_direct(
+    network: nn.Module,
+    device: torch.device,
+    frames: Sequence[Frame],
+    rows: Sequence[int],
+    spacecraft: Spacecraft,
+    bins: AttitudeBins,
+    input_size: int,
+) -> Validation:
+    """The oracle crop's errors; the score is that of the keypoint networks, of the points where the pose puts them."""
+    network.eval()
+    looking = Looking(input_size=input_size)
+    estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, looking=looking)
+    errors = []
+    for frame in _usable(frames, rows, spacecraft):
+        assert frame.image is not None
+        estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(spacecraft.points_m))
+        errors.append(metrics.errors(frame, estimate, spacecraft))
+    values = _means(errors)
     return Validation(values["rmse_px"], values)
 
 
