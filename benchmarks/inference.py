@@ -4,9 +4,9 @@
 
 --paper needs the extra `train`: it makes the network of the paper's size with random weights, whose speed is that of
 any others.
-`satellite_01` is a shipped model or a folder with keypoints.onnx and locator.onnx. Each figure is the median of
-`--runs` calls on one thread setting, after a warm-up; the picture is noise, which costs the networks what any picture
-does. The pose solver is timed on the projected keypoints with noise, since noise alone has no pose.
+`satellite_01` is a shipped model or a folder with keypoints.onnx (or direct.onnx) and locator.onnx. Each figure is the
+median of `--runs` calls on one thread setting, after a warm-up; the picture is noise, which costs the networks what any
+picture does. The pose solver is timed on the projected keypoints with noise, since noise alone has no pose.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
+from numpy import ndarray
 from rich.console import Console
 from rich.table import Table
 
 from gknet.crop import Crop
 from gknet.decode import decode_heatmaps
+from gknet.direct import DirectEstimator, decode_output
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, load_estimator
 from gknet.frame import Keypoints
@@ -46,30 +48,47 @@ def median_ms(call: Callable[[], object], runs: int) -> float:
     return 1000 * float(np.median(times))
 
 
-def stages(estimator: Estimator, runs: int) -> dict[str, float]:
+def stages(estimator: Estimator | DirectEstimator, runs: int) -> dict[str, float]:
     """Median milliseconds of each stage, and of the whole way from a 1024 x 1024 frame to a pose."""
     image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
-    craft, size = estimator.spacecraft, estimator.looking.input_size
-    pose = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0, 0, 4 * craft.diameter_m])
-    true_px = CAMERA.project(pose.transform(craft.points_m))
-    pixels = true_px + np.random.default_rng(1).normal(size=true_px.shape)
-    count = craft.keypoint_count
-    keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
-    crop = Crop(200, 200, 600, size)
+    crop = Crop(200, 200, 600, estimator.looking.input_size)
     given = network_input(image, crop)
-    heatmaps = estimator.keypoint_network(given)[0]
-    stride = size / heatmaps.shape[2]
-
-    found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs)}
-    found["keypoint network"] = median_ms(lambda: estimator.keypoint_network(given), runs)
-    found["decode"] = median_ms(lambda: decode_heatmaps(heatmaps, stride), runs)
-    found["pose"] = median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m), runs)
+    look = direct_stages if isinstance(estimator, DirectEstimator) else keypoint_stages
+    found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs), **look(estimator, given, crop, runs)}
     whole = sum(found.values())
     if estimator.locator is not None:
         found["locate (whole frame)"] = median_ms(lambda: estimator.locate(image), runs)
         whole += found["locate (whole frame)"]
     found["frame to pose"] = whole
     return found
+
+
+def keypoint_stages(estimator: Estimator, given: ndarray, crop: Crop, runs: int) -> dict[str, float]:
+    """From the crop to a pose by keypoints."""
+    craft = estimator.spacecraft
+    pose = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0, 0, 4 * craft.diameter_m])
+    true_px = CAMERA.project(pose.transform(craft.points_m))
+    pixels = true_px + np.random.default_rng(1).normal(size=true_px.shape)
+    count = craft.keypoint_count
+    keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
+    heatmaps = estimator.keypoint_network(given)[0]
+    stride = crop.size / heatmaps.shape[2]
+    return {
+        "keypoint network": median_ms(lambda: estimator.keypoint_network(given), runs),
+        "decode": median_ms(lambda: decode_heatmaps(heatmaps, stride), runs),
+        "pose": median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m), runs),
+    }
+
+
+def direct_stages(estimator: DirectEstimator, given: ndarray, crop: Crop, runs: int) -> dict[str, float]:
+    """From the crop to a pose that the network tells."""
+    output = estimator.network(given)[0]
+    shown = decode_output(output, estimator.bins)
+    return {
+        "direct network": median_ms(lambda: estimator.network(given), runs),
+        "decode": median_ms(lambda: decode_output(output, estimator.bins), runs),
+        "pose": median_ms(lambda: shown.pose(CAMERA, crop, estimator.spacecraft.diameter_m), runs),
+    }
 
 
 def write_paper_network(path: Path) -> None:
@@ -94,7 +113,7 @@ def paper_ms(path: Path, threads: int, runs: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx")
+    parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx or direct.onnx")
     parser.add_argument("--paper", action="store_true", help="time gknet-paper too, the unit of the ratios")
     parser.add_argument("--runs", type=int, default=100)
     chosen = parser.parse_args()

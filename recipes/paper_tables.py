@@ -1,4 +1,4 @@
-"""The paper's comparison, run fairly: GKNet, HRNet and ResUNet, and GKNet with other graphs. DMANet is yet to come.
+"""The paper's comparison, run fairly: GKNet, HRNet, ResUNet and DMANet, and GKNet with other graphs.
 
     pip install '.[render,train]'
     python recipes/paper_tables.py --scale cpu --work runs/paper --results results/paper_tables
@@ -10,9 +10,11 @@
 --scale full   a GPU: the paper's sizes and its training (squared error, Adam 0.01, 80 epochs, batch 16, five cosines,
                32x32 heatmaps) on every frame of the 300 sequences
 
+DMANet tells the pose directly: it has its own loss, no heatmaps, and so not the paper's read-out of them.
+
 Hardware   cpu: 2 cores with bfloat16; two shares in two terminals, each with OMP_NUM_THREADS=1, are faster than one run
            (--share 0/2 and --share 1/2)
-Time       cpu: about 9 hours of two cores; full: not run
+Time       cpu: about 11 hours of two cores; full: not run
 Expected   one small JSON for each training in RESULTS/SCALE, which paper_report.py turns into tables
 
 What is done is kept: stop it at any time and run it again. Only train sequences are trained on; validation chooses
@@ -36,10 +38,12 @@ import gknet
 from gknet.atomic import write_text
 from gknet.comparison import Trial
 from gknet.dataset.skd import SkdDataset
+from gknet.direct import DirectEstimator
 from gknet.errors import GknetError
 from gknet.estimator import load_estimator
-from gknet.evaluation import evaluate
+from gknet.evaluation import Run, evaluate
 from gknet.fleet import NAMES
+from gknet.onnx_network import OnnxNetwork
 from gknet.paper_protocol import PaperEstimator
 from gknet.render.generate import generate
 from gknet.training.checkpoint import CHECKPOINT
@@ -100,6 +104,7 @@ def methods(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
         Method("GKNet", ours),
         Method("HRNet", f"hrnet{suffix}"),
         Method("ResUNet", f"resunet{suffix}"),
+        Method("DMANet", f"dmanet{suffix}"),
     )
     ablation = (
         Method("GKNet, no edges", ours, "identity"),
@@ -263,23 +268,25 @@ def samples_seen(run: Path) -> int:
 
 
 def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -> dict[str, object]:
-    """The test frames under three protocols: the paper's read-out, ours with the oracle's and the detected crop."""
+    """The test frames under our protocols, oracle's and detected crop, and heatmaps under the paper's read-out too."""
     estimator = load_estimator(model)
     dataset = SkdDataset(work / "frames", "test", spacecraft)
-    runs = {run.protocol: run for run in evaluate(dataset, estimator).runs}
+    runs: dict[str, Run] = {run.protocol: run for run in evaluate(dataset, estimator).runs}
     size = estimator.looking.input_size
-    paper = PaperEstimator(estimator.keypoint_network, estimator.spacecraft, size)
-    runs_by_name = {**runs, "paper": evaluate(dataset, paper, ("oracle",)).runs[0]}
+    if isinstance(estimator, DirectEstimator):
+        network = estimator.network
+    else:
+        network = estimator.keypoint_network
+        paper = PaperEstimator(network, estimator.spacecraft, size)
+        runs["paper"] = evaluate(dataset, paper, ("oracle",)).runs[0]
     return {
         "name": method.name,
-        **cost(model, method, estimator.keypoint_network, size),
-        "protocols": {
-            name: Trial.of(run, method.key, spacecraft, seed).to_dict() for name, run in runs_by_name.items()
-        },
+        **cost(method, network, size),
+        "protocols": {name: Trial.of(run, method.key, spacecraft, seed).to_dict() for name, run in runs.items()},
     }
 
 
-def cost(model: Path, method: Method, network, size: int) -> dict[str, object]:
+def cost(method: Method, network: OnnxNetwork, size: int) -> dict[str, object]:
     """Parameters, multiply-accumulates at the deployed size, milliseconds of a crop."""
     import torch
     from torch.utils.flop_counter import FlopCounterMode

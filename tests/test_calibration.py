@@ -14,6 +14,7 @@ from gknet.errors import GknetError
 from gknet.estimator import Estimator
 from gknet.frame import Frame, Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.locate import Looking
 from gknet.metrics import nees
 from gknet.spacecraft import Spacecraft
 

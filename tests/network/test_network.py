@@ -11,11 +11,14 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 
+from gknet.direct import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.network.backbone import position_code  # noqa: E402
 from gknet.network.build import (  # noqa: E402
     build,
     configured,
+    dmanet,
+    dmanet_s,
     gknet_paper,
     gknet_s,
     hrnet,
@@ -24,6 +27,7 @@ from gknet.network.build import (  # noqa: E402
     resunet,
     resunet_s,
 )
+from gknet.network.dmanet import DMANet, DMANetConfig, MultiScaleAttention  # noqa: E402
 from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
 from gknet.network.graph import Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_belief  # noqa: E402
@@ -115,6 +119,55 @@ def test_the_baselines_at_any_size_and_number_of_keypoints(make: Callable[[int, 
         make(4, 16)
 
 
+def small_dmanet() -> DMANet:
+    torch.manual_seed(0)
+    return DMANet(DMANetConfig((4, 6, 8, 10), (2, 4, 4, 6), (1, 2, 1, 2), head=12, bins=4))
+
+
+def test_dmanet_tells_a_pose_at_any_input_size() -> None:
+    network = small_dmanet()
+    for size in (64, 128, 192):
+        output = network(torch.rand(2, 3, size, size))
+        assert output.shape == (2, 3 + AttitudeBins(4).count)
+        assert (output[:, 3:] >= 0).all()
+        torch.testing.assert_close(output[:, 3:].sum(dim=1), torch.ones(2))
+    network.eval()
+    images = torch.rand(3, 3, 64, 64)
+    torch.testing.assert_close(network(images)[1:2], network(images[1:2]), atol=1e-5, rtol=1e-4)
+    assert dmanet_s()(torch.rand(2, 3, 64, 64)).shape == (2, 3 + AttitudeBins(dmanet_s().config.bins).count)
+
+
+def test_gradients_reach_every_parameter_of_dmanet() -> None:
+    network = small_dmanet()
+    offset, log_depth, attitude = network.branches(torch.rand(4, 3, 64, 64))
+    (offset.square().sum() + log_depth.square().sum() + attitude.square().sum()).backward()
+    assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+
+
+def test_a_block_is_dense_and_looks_at_three_scales() -> None:
+    """What comes in goes out beside what is added; the convolutions of an MAB see 3, 5 and 7 cells across."""
+    block = MultiScaleAttention(5, 4).eval()
+    x = torch.randn(1, 5, 16, 16)
+    out = block(x)
+    assert out.shape == (1, 9, 16, 16)
+    torch.testing.assert_close(out[:, :5], x)
+    entered = torch.randn(1, 4, 16, 16)
+    moved = entered.clone()
+    moved[:, :, 8, 8] += 1
+    changed = [(scale.conv(entered) != scale.conv(moved)).any(dim=1)[0] for scale in block.scales]
+    assert [int(each.any(dim=0).sum()) for each in changed] == [3, 5, 7]
+
+
+def test_votes_for_the_origin_are_counted_from_each_cell() -> None:
+    """Sure cells decide; a vote of nothing is the cell's own centre, in sides of the crop from its middle."""
+    votes = torch.zeros(1, 3, 4, 8)
+    votes[0, 0, 3, 0] = 50.0
+    torch.testing.assert_close(DMANet._offset(votes), torch.tensor([[0.5 / 8 - 0.5, 3.5 / 4 - 0.5]]))
+    votes[0, 1:, 3, 0] = torch.tensor([0.3, -0.2])
+    torch.testing.assert_close(DMANet._offset(votes), torch.tensor([[0.5 / 8 - 0.2, 3.5 / 4 - 0.7]]))
+    torch.testing.assert_close(DMANet._offset(torch.zeros(1, 3, 4, 8)), torch.zeros(1, 2))
+
+
 def multiply_accumulates(network: torch.nn.Module) -> float:
     counter = FlopCounterMode(display=False)
     with counter:
@@ -124,7 +177,7 @@ def multiply_accumulates(network: torch.nn.Module) -> float:
 
 def test_the_small_networks_cost_the_same_to_run() -> None:
     ours = multiply_accumulates(gknet_s(chain(16)))
-    for other in (hrnet_s(16), resunet_s(16)):
+    for other in (hrnet_s(16), resunet_s(16), dmanet_s()):
         assert abs(multiply_accumulates(other) / ours - 1) < 0.05
 
 
@@ -133,6 +186,7 @@ def test_named_sizes() -> None:
     assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
     assert 28e6 < parameters(hrnet(16)) < 30e6
     assert 23e6 < parameters(resunet(16)) < 26e6
+    assert 25e6 < parameters(dmanet()) < 30e6
     assert 0.5e6 < parameters(locator()) < 0.8e6
 
 
@@ -227,6 +281,9 @@ def test_bad_choices_are_named() -> None:
             configured(HRNetConfig, sizes)
     with pytest.raises(GknetError, match="resunet"):
         ResUNetConfig(blocks=(0, 1, 1, 1))
+    for sizes in ({"head": 0}, {"bins": 7}):
+        with pytest.raises(GknetError, match="dmanet"):
+            DMANetConfig(**{"width": (4,) * 4, "growth": (4,) * 4, "blocks": (1,) * 4, "head": 4} | sizes)
     with pytest.raises(GknetError, match="loss"):
         build("gknet-s", chain(5), loss="hinge")
     with pytest.raises(GknetError, match="graph"):
