@@ -232,14 +232,14 @@ def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     assert estimator.looking.input_size == 64
     frames = SkdDataset(data, "val", "satellite_01")
     best = json.loads((finished / "run.json").read_text())["best"]
-    found = validate_direct(lambda_network(estimator), torch.device("cpu"), frames, [0, 1], CRAFT, estimator.bins, 64)
+    found = validate_direct(exported(estimator), torch.device("cpu"), frames, [0, 1], CRAFT, estimator.bins, 64)
     assert found.score == pytest.approx(best["score"], rel=0.02)
     frame = frames.frame(0)
     estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(POINTS))
     assert (estimate.cam_from_body is None) == (estimate.failure is not None)
 
 
-def lambda_network(estimator: DirectEstimator) -> torch.nn.Module:
+def exported(estimator: DirectEstimator) -> torch.nn.Module:
     """The exported network in the place of a torch one."""
 
     class Exported(torch.nn.Module):

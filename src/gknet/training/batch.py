@@ -93,8 +93,10 @@ def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sam
 
 
 def _warped_pose(cache: Cache, row: int, matrix: Float[ndarray, "3 3"], size: int) -> Float[ndarray, "7"]:
-    pose = CropPose.from_vector(cache.poses[row].astype(np.float64))
-    return pose.warped(matrix, cache.size, size).vector.astype(np.float32)
+    vector = cache.poses[row].astype(np.float64)
+    if np.isfinite(vector).all():
+        vector = CropPose.from_vector(vector).warped(matrix, cache.size, size).vector
+    return vector.astype(np.float32)
 
 
 def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, "n"]:
