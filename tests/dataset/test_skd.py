@@ -110,7 +110,7 @@ def test_poses_points_cameras_and_extras_come_back(written: tuple) -> None:
         np.testing.assert_allclose(frame.camera.matrix, expected.camera.matrix, rtol=1e-8)
         np.testing.assert_allclose(frame.sun_direction, expected.sun_direction, atol=1e-8)
         np.testing.assert_array_equal(frame.visible, expected.visible)
-        assert (frame.time_s, extras.earth, extras.recipe, extras.seed) == (
+        assert (frame.time_s, frame.earth_in_view, extras.recipe, extras.seed) == (
             expected.time_s,
             expected.earth,
             "skd",

@@ -27,7 +27,6 @@ class Extras:
     """What SKD rows say beyond a Frame; None where the folder does not say.
 
     index   the frame's place in its sequence, from 0
-    earth   whether the Earth is in the picture
     """
 
     index: int
@@ -36,7 +35,6 @@ class Extras:
     image_path: Path
     mask_path: Path | None
     depth_path: Path | None
-    earth: bool | None
     recipe: str | None
     seed: int | None
 
@@ -115,6 +113,7 @@ class SkdDataset(Sequence[Frame]):
             visible=annotation.visible,
             sun_direction=annotation.sun_direction,
             time_s=annotation.time_s,
+            earth_in_view=annotation.earth,
         )
 
     def extras(self, i: int) -> Extras:
@@ -129,7 +128,6 @@ class SkdDataset(Sequence[Frame]):
             image_path=sequence.image_path(annotation.index),
             mask_path=mask_path if mask_path.exists() else None,
             depth_path=depth_path if depth_path.exists() else None,
-            earth=annotation.earth,
             recipe=annotation.recipe,
             seed=annotation.seed,
         )
