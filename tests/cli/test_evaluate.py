@@ -67,6 +67,7 @@ def test_page_holds_everything_and_agrees(
     use(ToyEstimator(error=1.0, blind=frozenset({4})))
     metrics, page = evaluated(dataset, tmp_path)
     assert list(metrics["runs"]) == ["oracle", "detected"]
+    assert metrics["unknown"] == []
     for protocol, found in metrics["runs"].items():
         assert found["frames"] == 10
         assert found["sequences"] == 2
