@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import csv
 from pathlib import Path
 
 import cv2
@@ -18,9 +20,11 @@ from gknet.dataset.skd_write import (
     write_sequence_files,
     write_splits,
 )
+from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera, Pose
 from gknet.spacecraft import Spacecraft
+from gknet.torch_file import load_torch_file
 from tests.dataset import authors
 
 SIZE = 96
@@ -103,14 +107,20 @@ def test_the_skeletons_of_our_folders_load_as_theirs(ours: Path) -> None:
         assert sorted(map(tuple, edges)) == sorted(EDGES)
 
 
-def test_a_folder_of_theirs_reads_as_it_was_written(tmp_path: Path) -> None:
+def write_theirs(root: Path) -> dict[str, list[authors.Shot]]:
+    """Three frames of one spacecraft in each split."""
     pytest.importorskip("torch")
     random = np.random.default_rng(8)
     shots = {}
     for split in SPLITS:
         poses = [pose(random) for _ in range(3)]
         shots[split] = [authors.Shot(picture(random), p.rotation, p.translation_m) for p in poses]
-    authors.write(tmp_path, "Satellite_03", CAMERA.matrix, POINTS, list(EDGES), shots)
+    authors.write(root, "Satellite_03", CAMERA.matrix, POINTS, list(EDGES), shots)
+    return shots
+
+
+def test_a_folder_of_theirs_reads_as_it_was_written(tmp_path: Path) -> None:
+    shots = write_theirs(tmp_path)
     for split, written in shots.items():
         dataset = SkdDataset(tmp_path, split, "satellite_03")
         assert dataset.spacecraft.edges == tuple(sorted(EDGES))
@@ -128,3 +138,53 @@ def test_a_folder_of_theirs_reads_as_it_was_written(tmp_path: Path) -> None:
         dataset = SkdDataset(tmp_path, record.split)
         i = int(record.image_path.stem) - 1
         assert_same(record, dataset.frame(i), dataset.extras(i).image_path, dataset.spacecraft.points_m)
+
+
+def test_a_quaternion_and_its_negative_are_one_pose(tmp_path: Path) -> None:
+    write_theirs(tmp_path)
+    before = [frame.cam_from_body for frame in SkdDataset(tmp_path)]
+    for table in tmp_path.glob("data/*/annotations.csv"):
+        with open(table, newline="") as file:
+            rows = list(csv.DictReader(file))
+        with open(table, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            for row in rows:
+                row["orientation"] = str([-value for value in ast.literal_eval(row["orientation"])])
+                writer.writerow(row)
+    for one, frame in zip(before, SkdDataset(tmp_path), strict=True):
+        assert one is not None
+        assert frame.cam_from_body is not None
+        np.testing.assert_array_equal(one.rotation, frame.cam_from_body.rotation)
+
+
+def test_row_i_is_the_picture_i_plus_1_whatever_pictures_are_lost(tmp_path: Path) -> None:
+    shots = write_theirs(tmp_path)
+    images = tmp_path / "data/000001/image"
+    (images / "000001.jpg").unlink()
+    dataset = SkdDataset(tmp_path, "train")
+    with pytest.raises(GknetError, match=r"000001.jpg"):
+        dataset.frame(0)
+    for i in (1, 2):
+        frame = dataset.frame(i)
+        assert frame.cam_from_body is not None
+        np.testing.assert_allclose(frame.cam_from_body.translation_m, shots["train"][i].translation, atol=1e-9)
+        assert dataset.extras(i).image_path.name == f"00000{i + 1}.jpg"
+    assert dataset.frame(0, image=False).camera.width == SIZE
+    (images / "000003.jpg").rename(images / "000007.jpg")
+    with pytest.raises(GknetError, match=r"3 rows, yet there is an image 000007"):
+        SkdDataset(tmp_path, "train")
+
+
+def test_a_skeleton_is_read_once_and_not_for_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_theirs(tmp_path)
+    read: list[Path] = []
+
+    def counted(path: Path) -> object:
+        read.append(path)
+        return load_torch_file(path)
+
+    monkeypatch.setattr("gknet.dataset.skd_sequence.load_torch_file", counted)
+    dataset = SkdDataset(tmp_path)
+    assert len([(frame, dataset.spacecraft) for frame in dataset]) == 9
+    assert len(read) == 1

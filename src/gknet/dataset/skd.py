@@ -143,10 +143,19 @@ class SkdDataset(Sequence[Frame]):
     def _size(self, s: int) -> tuple[int, int]:
         """Height and width of a sequence's images, where only the images know them."""
         if s not in self._sizes:
-            sequence = self._sequences[s]
-            height, width = read_image(sequence.image_path(sequence.indices[0])).shape[:2]
-            self._sizes[s] = height, width
+            self._sizes[s] = _first_size(self._sequences[s])
         return self._sizes[s]
+
+
+def _first_size(sequence: SkdSequence) -> tuple[int, int]:
+    """Height and width of the first image that can be read."""
+    for index in sequence.indices:
+        try:
+            height, width = read_image(sequence.image_path(index)).shape[:2]
+        except GknetError:
+            continue
+        return height, width
+    raise GknetError(f"{sequence.folder / 'image'}: no image can be read, so their size is unknown")
 
 
 def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
@@ -172,7 +181,7 @@ def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
 def _read_split(path: Path) -> list[tuple[str, str]]:
     try:
         listing = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise GknetError(f"{path}: cannot read the split file ({error})") from error
     lists = listing.values() if isinstance(listing, dict) else [None]
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
