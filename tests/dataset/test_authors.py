@@ -171,6 +171,9 @@ def test_row_i_is_the_picture_i_plus_1_whatever_pictures_are_lost(tmp_path: Path
         np.testing.assert_allclose(frame.cam_from_body.translation_m, shots["train"][i].translation, atol=1e-9)
         assert dataset.extras(i).image_path.name == f"00000{i + 1}.jpg"
     assert dataset.frame(0, image=False).camera.width == SIZE
+    cv2.imwrite(str(images / "000002.jpg"), np.zeros((SIZE, SIZE + 8, 3), np.uint8))
+    with pytest.raises(GknetError, match=r"000002.jpg: expected 96 x 96 pixels"):
+        dataset.frame(1)
     (images / "000003.jpg").rename(images / "000007.jpg")
     with pytest.raises(GknetError, match=r"3 rows, yet there is an image 000007"):
         SkdDataset(tmp_path, "train")

@@ -100,12 +100,12 @@ class SkdDataset(Sequence[Frame]):
         pixels = read_image(sequence.image_path(annotation.index)) if image else None
         camera = annotation.camera
         if camera is None:
-            height, width = pixels.shape[:2] if pixels is not None else self._size(self._rows[i][0])
+            height, width = self._size(self._rows[i][0])
             camera = Camera(sequence.camera_matrix, width, height)
         if pixels is not None and pixels.shape[:2] != (camera.height, camera.width):
             raise GknetError(
-                f"{sequence.image_path(annotation.index)}: expected {camera.width} x {camera.height} pixels by its "
-                f"label, got {pixels.shape[1]} x {pixels.shape[0]}"
+                f"{sequence.image_path(annotation.index)}: expected {camera.width} x {camera.height} pixels as in "
+                f"its label or its sequence, got {pixels.shape[1]} x {pixels.shape[0]}"
             )
         return Frame(
             name=f"{sequence.folder.name}/{frame_stem(annotation.index)}",
@@ -214,8 +214,10 @@ def _declared_spacecraft(root: Path, category: str) -> Spacecraft | None:
 
 def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
     points = sequence.points_m
-    skeleton = read_skeleton(sequence.folder, len(points))
     span = np.linalg.norm(points[:, None] - points[None], axis=2)
+    if len(points) < 4 or span.max() < SAME_POINT_M:
+        raise GknetError(f"{sequence.folder / 'keypoints.txt'}: expected 4 keypoints or more, apart from each other")
+    skeleton = read_skeleton(sequence.folder, len(points))
     return Spacecraft(
         name=sequence.category,
         keypoint_names=skeleton.keypoint_names,

@@ -75,8 +75,14 @@ def load_checkpoint(
         if torch.cuda.is_available() and content["cuda_rng"]:
             torch.cuda.set_rng_state_all(content["cuda_rng"])
         return State(**content["state"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:  # a part is missing or does not fit
-        raise GknetError(f"{path}: it does not fit this training ({str(error).splitlines()[0]})") from error
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # a part is missing or of another kind
+        raise GknetError(f"{path}: it does not fit this training ({error!r})") from error
 
 
 def save_weights(path: Path, weights: Mapping[str, Tensor], metadata: Mapping[str, object]) -> None:
