@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,20 +9,8 @@ import numpy as np
 from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.evaluation import evaluate, taken_for
-from gknet.frame import Box, Estimate, Keypoints
-from gknet.geometry import Camera
-from tests.cli.toy import ToyEstimator, write_toy_dataset
-
-
-@dataclass(frozen=True, eq=False)
-class Noting(ToyEstimator):
-    """Notes the boxes that it is given."""
-
-    given: list[Box | None] = field(default_factory=list)
-
-    def estimate(self, image: np.ndarray, camera: Camera, box: Box | None = None) -> Estimate:
-        self.given.append(box)
-        return super().estimate(image, camera, box)
+from gknet.frame import Keypoints
+from tests.cli.toy import Noting, ToyEstimator, write_toy_dataset
 
 
 def test_the_truth_makes_the_oracles_crop_and_no_other(tmp_path: Path) -> None:
