@@ -80,7 +80,11 @@ def _label_key(frames: FrameSource, points_m: Float[ndarray, "n 3"], window: Win
     digest = hashlib.sha256(f"{LAYOUT} {window} {size} {MARGIN} {WHOLE} {stamp}".encode())
     digest.update(np.ascontiguousarray(points_m).tobytes())
     for i in range(len(frames)):
-        frame = frames.frame(i, image=False)
+        try:
+            frame = frames.frame(i, image=False)
+        except GknetError as error:  # a bad label: the frame is left out, and reported when the cache is written
+            digest.update(str(error).encode())
+            continue
         digest.update(f"{frame.name} {frame.camera.width} {frame.camera.height}".encode())
         digest.update(frame.camera.matrix.tobytes())
         if frame.cam_from_body is not None:
