@@ -29,6 +29,7 @@ import torch
 from gknet.cli.evaluate import evaluate
 from gknet.fleet import NAMES
 from gknet.render.generate import generate
+from gknet.render.recipe import RECIPES
 from gknet.training.checkpoint import BEST, CHECKPOINT
 from gknet.training.export import export_run
 from gknet.training.loop import train
@@ -37,7 +38,7 @@ from gknet.training.settings import TrainSettings
 
 DATA_SEED, TRAINING_SEED = 0, 1
 FIRST_STAGES = (Stage(0.55, 128, 16), Stage(0.25, 192, 16), Stage(0.20, 256, 16))
-KEYPOINT_STAGES = (Stage(0.35, 128, 16), Stage(0.65, 192, 16))
+KEYPOINT_STAGES = (Stage(0.5, 128, 16), Stage(0.5, 192, 16))
 FULL_STAGES = (Stage(0.4, 128, 32), Stage(0.2, 192, 32), Stage(0.4, 256, 32))
 
 
@@ -45,11 +46,14 @@ FULL_STAGES = (Stage(0.4, 128, 32), Stage(0.2, 192, 32), Stage(0.4, 256, 32))
 class Scale:
     """How much is rendered and trained. `every` = 2 takes each second frame of a sequence of 300.
 
+    sequences         of the training data, for all three spacecraft, 3/5 of them to train on: more than skd's 300, with
+                      few frames of each, since frames of one sequence share their light and their background
     first_minutes     of the run on the first spacecraft whose weights all three start from, unless others are given
     keypoint_minutes  of each spacecraft's own run
     jobs              runs at a time; each has its share of the cores
     """
 
+    sequences: int
     crops_every: int
     pictures_every: int
     val_every: int
@@ -62,16 +66,42 @@ class Scale:
 
 
 SCALES = {
-    "cpu": Scale(2, 6, 30, 15, 17, (60, 76, 50), 11, KEYPOINT_STAGES, 2),
-    "full": Scale(1, 1, 10, 1, 60, (600, 600, 600), 60, FULL_STAGES, 1),
+    "cpu": Scale(
+        sequences=4500,
+        crops_every=50,
+        pictures_every=100,
+        val_every=30,
+        test_every=15,
+        first_minutes=17,
+        keypoint_minutes=(36, 52, 41),
+        locator_minutes=7,
+        stages=KEYPOINT_STAGES,
+        jobs=2,
+    ),
+    "full": Scale(
+        sequences=4500,
+        crops_every=6,
+        pictures_every=30,
+        val_every=10,
+        test_every=1,
+        first_minutes=60,
+        keypoint_minutes=(600, 600, 600),
+        locator_minutes=60,
+        stages=FULL_STAGES,
+        jobs=1,
+    ),
 }
 
 
 def render(work: Path, scale: Scale) -> None:
-    """Crops to train the keypoints on, small whole pictures for the locator, whole frames to judge by."""
+    """Crops to train the keypoints on, small whole pictures for the locator, whole frames to judge by.
+
+    The first 300 sequences of the longer recipe are skd's own, so its train split holds none of skd's val and test.
+    """
+    longer = RECIPES["skd"].model_copy(update={"sequences": scale.sequences})
     for name in NAMES:
-        generate("skd", work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every)
-        generate("skd", work / "pictures", DATA_SEED, name, "train", every=scale.pictures_every, size=256)
+        generate(longer, work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every)
+        generate(longer, work / "pictures", DATA_SEED, name, "train", every=scale.pictures_every, size=256)
         generate("skd", work / "frames", DATA_SEED, name, "val", every=scale.val_every)
         generate("skd", work / "frames", DATA_SEED, name, "test", every=scale.test_every)
         generate("skd-hard", work / "hard", DATA_SEED, name, "test", every=scale.test_every)

@@ -1,12 +1,35 @@
-"""Which keypoint a detection is taken for."""
+"""Whose box an estimate is given, that every frame counts, and which keypoint a detection is taken for."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 
 from gknet.crop import Crop
-from gknet.evaluation import taken_for
+from gknet.dataset.skd import SkdDataset
+from gknet.evaluation import evaluate, taken_for
 from gknet.frame import Keypoints
+from tests.cli.toy import Noting, ToyEstimator, write_toy_dataset
+
+
+def test_the_truth_makes_the_oracles_crop_and_no_other(tmp_path: Path) -> None:
+    dataset = SkdDataset(write_toy_dataset(tmp_path / "set", sequences=1, frames=3))
+    truth = [dataset.frame(i, image=False).true_box(dataset.spacecraft.points_m) for i in range(3)]
+    for protocol, boxes in (("oracle", truth), ("detected", [None] * 3)):
+        estimator = Noting()
+        evaluate(dataset, estimator, (protocol,))
+        assert estimator.given == boxes
+
+
+def test_every_frame_counts_the_last_one_too(tmp_path: Path) -> None:
+    """One failure, wherever it is, is one seventh of the mean."""
+    dataset = SkdDataset(write_toy_dataset(tmp_path / "set", sequences=1, frames=7))
+    for lost in (0, 6):
+        (run,) = evaluate(dataset, ToyEstimator(blind=frozenset({lost})), ("detected",)).runs
+        found = run.summary.metrics
+        assert found["e_t"].frames == found["rmse_px"].frames == 7
+        np.testing.assert_allclose(found["e_q_rad"].mean, np.pi / 7, rtol=1e-5)
 
 
 def test_a_swap_is_near_another_keypoint_and_far_from_its_own() -> None:

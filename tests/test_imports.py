@@ -16,7 +16,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 
 LAYERS = (
     {"errors"},
-    {"atomic", "geometry", "progress"},
+    {"atomic", "geometry", "progress", "torch_file"},
     {"frame", "image", "video"},
     {"crop", "spacecraft"},
     {"decode", "onnx_network", "pnp"},

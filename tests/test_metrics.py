@@ -132,7 +132,7 @@ def test_a_failure_counts() -> None:
 
 def test_unknown_visibility_is_none_not_zero() -> None:
     found = errors(replace(FRAME, visible=None, sun_direction=None), estimate_at(POSE), CRAFT)
-    assert found.rmse_hidden_px is found.visible_fraction is found.phase_angle_rad is None
+    assert found.rmse_hidden_px is found.visible_fraction is found.phase_angle_rad is found.earth_in_view is None
     metrics = summarise([found]).metrics
     assert "rmse_hidden_px" not in metrics
     assert metrics["rmse_px"].frames == 1
@@ -156,7 +156,8 @@ def many(sequences: int, frames: int, seed: int) -> list[FrameErrors]:
             e_t = 1.0 if k % 10 == 9 else 0.01
             reason = f"only {k} points" if k % 10 == 9 else None
             rmse = level + generator.normal(0, 0.5)
-            found.append(replace(one, name=f"{s}/{k}", sequence=str(s), rmse_px=rmse, e_t=e_t, failure=reason))
+            known = {"rmse_px": rmse, "e_t": e_t, "failure": reason, "earth_in_view": float(s % 3 == 0)}
+            found.append(replace(one, name=f"{s}/{k}", sequence=str(s), **known))
     return found
 
 
@@ -166,9 +167,10 @@ def test_summary_counts_everything() -> None:
     assert summary.metrics["e_t"].mean == pytest.approx(0.1 + 0.9 * 0.01)
     assert summary.metrics["e_t"].median == 0.01
     assert all(statistic.frames == 120 for statistic in summary.metrics.values())
-    for by in ("range_diameters", "phase_angle_rad", "visible_fraction"):
+    for by in ("range_diameters", "phase_angle_rad", "visible_fraction", "earth_in_view"):
         assert sum(b.frames for b in summary.bins if b.by == by) == 120
         assert sum(b.failures for b in summary.bins if b.by == by) == 12
+    assert [b.frames for b in summary.bins if b.by == "earth_in_view"] == [80, 40]
     assert summary.located_07 == 1.0
     assert summary.coverage_95 == 1.0
 

@@ -27,6 +27,12 @@ SWAP_PX = 10.0
 
 PROTOCOL_WORDS: dict[Protocol, str] = {"oracle": "oracle crop", "detected": "detected crop"}
 
+UNKNOWN_WORDS = {
+    "visible": "which keypoints the spacecraft hides, so there are no errors of hidden ones",
+    "sun_direction": "where the sun is, so there are no phase angles",
+}
+"""What a dataset without a column leaves unknown."""
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -73,11 +79,22 @@ class Evaluation:
     runs: tuple[Run, ...]
     passed_over: tuple[Unreadable, ...]
 
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """The columns of UNKNOWN_WORDS that no frame has."""
+        cases = self.runs[0].cases
+        known = {
+            "visible": any(case.seen is not None for case in cases),
+            "sun_direction": any(case.errors.phase_angle_rad is not None for case in cases),
+        }
+        return tuple(column for column in UNKNOWN_WORDS if not known[column])
+
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON; lengths in metres or diameters, angles in radians, keypoints in pixels of the 256 crop."""
         return {
             "spacecraft": self.spacecraft.name,
             "data": self.data,
+            "unknown": list(self.unknown),
             "passed_over": [{"name": bad.name, "reason": bad.reason} for bad in self.passed_over],
             "runs": {run.protocol: self._run_dict(run) for run in self.runs},
         }

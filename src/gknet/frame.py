@@ -72,6 +72,7 @@ class Frame:
     image          (h, w, 3) uint8 RGB; None where only the labels were read
     visible        (n,) bool per keypoint: in view and not hidden by the spacecraft; None when unknown
     sun_direction  unit vector to the sun in the camera frame
+    earth_in_view  whether a part of the Earth is in the picture; None when unknown
     """
 
     name: str
@@ -81,6 +82,7 @@ class Frame:
     visible: Bool[ndarray, "n"] | None = None
     sun_direction: Float[ndarray, "3"] | None = None
     time_s: float | None = None
+    earth_in_view: bool | None = None
 
     def keypoints_px(self, points_m: Float[ndarray, "n 3"]) -> Float[ndarray, "n 2"]:
         """The true keypoints in pixels, projected from the pose; NaN behind the camera."""

@@ -35,6 +35,7 @@ FAILED_SPEED = FAILED_E_T + FAILED_E_Q
 RANGE_EDGES_DIAMETERS = (0.0, 1.5, 2.5, 4.0, 7.0, 12.0, np.inf)
 PHASE_EDGES_DEG = (0.0, 30.0, 60.0, 90.0, 120.0, 180.0)
 VISIBLE_EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 1.0)
+EARTH_EDGES = (0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class FrameErrors:
     locator_iou        of the estimate's box with the true one
     nees               squared pose error over the covariance: 6 in the mean when the covariance is right
     visible_fraction   keypoints in view and not hidden, over all
+    earth_in_view      1 with a part of the Earth in the picture, 0 without
     """
 
     name: str
@@ -70,6 +72,7 @@ class FrameErrors:
     range_diameters: float
     phase_angle_rad: float | None
     visible_fraction: float | None
+    earth_in_view: float | None
 
 
 def oracle_crop(frame: Frame, spacecraft: Spacecraft, size: int = ORACLE_SIZE) -> Crop:
@@ -121,6 +124,7 @@ def errors(
         range_diameters=distance_m / spacecraft.diameter_m,
         phase_angle_rad=frame.phase_angle_rad,
         visible_fraction=None if frame.visible is None else float((frame.visible & in_view).mean()),
+        earth_in_view=None if frame.earth_in_view is None else float(frame.earth_in_view),
     )
 
 
@@ -238,7 +242,7 @@ class Summary:
 
 
 def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int = 1000) -> Summary:
-    """Means, medians and 95 % intervals of every metric, overall and in bins of range, phase angle and visibility."""
+    """Means, medians and 95 % intervals of every metric: overall, by range, phase angle, visibility and background."""
     if not frame_errors:
         raise GknetError("summary: expected at least one frame, got none")
     squared = np.array([e.nees for e in frame_errors if e.nees is not None])
@@ -301,6 +305,7 @@ def _bins(frame_errors: Sequence[FrameErrors], seed: int, resamples: int) -> lis
         ("range_diameters", RANGE_EDGES_DIAMETERS),
         ("phase_angle_rad", phase),
         ("visible_fraction", VISIBLE_EDGES),
+        ("earth_in_view", EARTH_EDGES),
     ):
         values = np.array([np.nan if (v := getattr(e, by)) is None else v for e in frame_errors], dtype=np.float64)
         for low, high in pairwise(edges):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from collections.abc import Callable
@@ -67,6 +68,7 @@ def test_page_holds_everything_and_agrees(
     use(ToyEstimator(error=1.0, blind=frozenset({4})))
     metrics, page = evaluated(dataset, tmp_path)
     assert list(metrics["runs"]) == ["oracle", "detected"]
+    assert metrics["unknown"] == []
     for protocol, found in metrics["runs"].items():
         assert found["frames"] == 10
         assert found["sequences"] == 2
@@ -124,6 +126,32 @@ def test_lost_image_is_passed_over(use: Use, tmp_path: Path, capsys: pytest.Capt
     assert metrics["runs"]["detected"]["frames"] == 2
     assert "000002.jpg" in metrics["passed_over"][0]["reason"]
     assert "1 frames were passed over" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["[nan, 0, 9]", "[1 + 1, 0, 9]", "[__import__('os').mkdir('{mark}') or 0, 0, 9]"])
+def test_a_bad_label_is_passed_over_and_never_run(
+    text: str, use: Use, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tests.cli.toy import write_toy_dataset
+
+    use(ToyEstimator())
+    root = write_toy_dataset(tmp_path / "set", sequences=1, frames=3)
+    mark, table = tmp_path / "mark", root / "data" / "000001" / "annotations.csv"
+    with open(table, newline="") as file:
+        rows = list(csv.DictReader(file))
+    rows[1]["position"] = text.replace("{mark}", str(mark))
+    with open(table, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    metrics, _ = evaluated(root, tmp_path / "out")
+    assert metrics["runs"]["detected"]["frames"] == 2
+    assert "row 2: position" in metrics["passed_over"][0]["reason"]
+    assert "1 frames were passed over" in capsys.readouterr().out
+    assert not mark.exists()
+    assert run(["predict", str(root), "--spacecraft", "toycraft", "--out", str(tmp_path / "poses")]) == 0
+    assert "row 2: position" in (tmp_path / "poses" / "poses.jsonl").read_text(encoding="utf-8")
+    assert not mark.exists()
 
 
 def test_refusals(use: Use, refused: Callable[..., str], dataset: Path, tmp_path: Path) -> None:

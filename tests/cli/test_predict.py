@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from gknet.cli.main import run
+from gknet.dataset.skd import SkdDataset
+from gknet.frame import Box
 from gknet.image import read_image, write_image
 from gknet.video import VideoWriter, open_video
-from tests.cli.toy import FOCAL_PX, SIZE, ToyEstimator, toy_picture, toy_pose
+from tests.cli.toy import FOCAL_PX, SIZE, Noting, ToyEstimator, toy_picture, toy_pose
 
 Use = Callable[[ToyEstimator], None]
 Refused = Callable[..., str]
@@ -146,6 +148,19 @@ def test_dataset_passes_over_a_lost_image(use: Use, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert predict(root, *MODEL, "--out", out) == 0
     assert [record["status"] for record in records(out)] == ["ok", "unreadable", "ok"]
+
+
+def test_the_truth_is_taken_only_when_it_is_asked_for(use: Use, dataset: Path, tmp_path: Path) -> None:
+    for words, boxes in (((), [None] * 10), (("--oracle",), [frame_box(dataset, i) for i in range(10)])):
+        estimator = Noting()
+        use(estimator)
+        assert predict(dataset, *MODEL, "--no-overlay", "--out", tmp_path / "out", *words) == 0
+        assert estimator.given == boxes
+
+
+def frame_box(dataset: Path, i: int) -> Box | None:
+    frames = SkdDataset(dataset)
+    return frames.frame(i, image=False).true_box(frames.spacecraft.points_m)
 
 
 def test_box_is_used(use: Use, pictures: Path, tmp_path: Path) -> None:

@@ -116,3 +116,14 @@ class ToyEstimator:
         )
         covariance = np.diag([4e-4, 4e-4, 4e-4, 2.5e-3, 2.5e-3, 2.5e-3])
         return Estimate(keypoints, moved, covariance, np.ones(count, dtype=bool), self.error, box or found)
+
+
+@dataclass(frozen=True, eq=False)
+class Noting(ToyEstimator):
+    """Notes the boxes that it is given."""
+
+    given: list[Box | None] = field(default_factory=list)
+
+    def estimate(self, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
+        self.given.append(box)
+        return super().estimate(image, camera, box)

@@ -235,6 +235,30 @@ def test_renumbering_the_keypoints_renumbers_nodes_and_nothing_else() -> None:
     torch.testing.assert_close(layer(nodes)[:, order], other(nodes[:, order]))
 
 
+def test_renumbering_the_keypoints_of_a_network_renumbers_its_channels() -> None:
+    """Channel k, node k and row k of the adjacency are one keypoint: whoever moves one of them moves them all."""
+    order = np.array([3, 0, 4, 1, 2])
+    network = tiny(5).eval()
+    other = GKNet(network.config, chain(5)[np.ix_(order, order)]).eval()
+    weights = network.state_dict()
+    torch.nn.init.normal_(weights["fusion.join.weight"])
+    for name in ("pixel_head.weight", "pixel_head.bias", "decoder.queries", "fusion.join.bias"):
+        weights[name] = weights[name][order]
+    weights["fusion.join.weight"] = weights["fusion.join.weight"][order][:, [*order, *(order + 5)]]
+    other.load_state_dict(weights)
+    image = torch.rand(2, 3, 64, 64)
+    torch.testing.assert_close(other(image), network(image)[:, order], atol=1e-4, rtol=1e-4)
+
+
+def test_every_picture_of_a_batch_is_mixed_by_the_same_matrix() -> None:
+    torch.manual_seed(3)
+    adjacency = normalised_adjacency(chain(5))
+    layer = GraphConvolution(adjacency, 8, 8)
+    for nodes in (torch.randn(3, 5, 8), torch.randn(3, 5, 8) - 2, torch.zeros(1, 5, 8)):
+        mixed = torch.einsum("nm,bmc->bnc", adjacency, layer.mix(nodes))
+        torch.testing.assert_close(layer(nodes), layer.linear(mixed.relu()))  # eq. 2
+
+
 def test_at_the_start_both_branches_reach_the_output_channel_by_channel() -> None:
     fusion = Fusion(3)
     pixels, nodes = torch.randn(1, 3, 4, 4), torch.randn(1, 3, 4, 4)

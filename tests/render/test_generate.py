@@ -26,6 +26,7 @@ from gknet.render.recipe import Recipe, load_recipe
 from gknet.render.scenario import CAMERA, Sensor, Shot
 from gknet.render.scene import Rendered, Renderer
 from gknet.spacecraft import Spacecraft, save_spacecraft
+from tests.dataset import authors
 
 POINTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.5], [0, 0, 1]])
 SENSOR = Sensor(
@@ -299,3 +300,17 @@ def test_recipe_json_tells_what_the_folder_is(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "recipe.json").read_text())
     assert (told["seed"], told["window"], told["recipe"]["name"]) == (5, "frame", "skd")
     assert read_image(tmp_path / "contact_sheet.jpg").shape[1] == 3 * 256
+
+
+def test_a_reader_of_the_authors_rules_finds_the_keypoints_in_our_pictures(tmp_path: Path) -> None:
+    run(tmp_path, size=128, recipe=recipe(sequences=15, frames=3))
+    records = authors.read(tmp_path, 128)
+    assert Counter(record.split for record in records) == {"train": 27, "val": 9, "test": 9}
+    seen = 0
+    for record in records:
+        image = read_image(record.image_path)
+        for x, y in record.keypoints:
+            if 2 < x < 126 and 2 < y < 126:
+                assert image[int(y), int(x)].min() > 200
+                seen += 1
+    assert seen > 100

@@ -13,10 +13,10 @@ torch = pytest.importorskip("torch")
 from gknet.crop import Crop  # noqa: E402
 from gknet.dataset.skd import SkdDataset  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.frame import Frame  # noqa: E402
+from gknet.frame import Box, Frame  # noqa: E402
 from gknet.geometry import Camera, Pose  # noqa: E402
-from gknet.training.batch import Loader, draw_box, draw_keypoints  # noqa: E402
-from gknet.training.cache import build_cache, cached_row, craft_window  # noqa: E402
+from gknet.training.batch import Loader, Sample, draw_box, draw_keypoints  # noqa: E402
+from gknet.training.cache import Cache, build_cache, cached_row, craft_window  # noqa: E402
 from gknet.training.schedule import Stage  # noqa: E402
 from tests.training.toy import POINTS, drawn, toy_spacecraft, write_toy  # noqa: E402
 
@@ -36,12 +36,16 @@ def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 5
     return Frame("one", drawn(camera, pose), camera, pose)
 
 
+def box_of(frame: Frame) -> Box:
+    box = frame.true_box(POINTS)
+    assert box is not None
+    return box
+
+
 def test_a_cached_row_is_the_frame_through_a_crop() -> None:
     frame = a_frame((0.3, -0.2, 30.0))
-    row = cached_row(frame, CRAFT, "craft", 160)
-    box = frame.true_box(POINTS)
+    row, box = cached_row(frame, CRAFT, "craft", 160), box_of(frame)
     assert row is not None
-    assert box is not None
     crop = craft_window(frame, box, 160)
     assert crop == Crop.around(box, 160, 1.6)
     np.testing.assert_allclose(crop.to_image(row.points_px), frame.keypoints_px(POINTS))
@@ -53,9 +57,7 @@ def test_a_cached_row_is_the_frame_through_a_crop() -> None:
 
 def test_a_window_around_the_craft_is_taken_whole() -> None:
     frame = a_frame((0, 0, 8), 200)
-    box = frame.true_box(POINTS)
-    assert box is not None
-    assert craft_window(frame, box, 160) == Crop(0, 0, 200, 160)
+    assert craft_window(frame, box_of(frame), 160) == Crop(0, 0, 200, 160)
 
 
 def test_truncation_masks_and_never_renumbers() -> None:
@@ -66,7 +68,7 @@ def test_truncation_masks_and_never_renumbers() -> None:
     inside = frame.camera.contains(truth)
     assert 4 <= inside.sum() < len(POINTS)
     np.testing.assert_array_equal(row.in_view, inside)
-    assert row.points_px.shape == truth.shape
+    np.testing.assert_allclose(row.points_px, craft_window(frame, box_of(frame), 160).to_input(truth))
 
 
 def test_frames_without_the_craft_are_no_rows() -> None:
@@ -106,6 +108,35 @@ def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: 
     assert not list(tmp_path.glob("*.tmp"))
 
 
+def test_the_cache_keeps_every_point_in_its_row_and_below_the_pixel(tmp_path: Path) -> None:
+    frames = [a_frame((3.0 - k, 0.5, 12.0), 256) for k in range(3)]
+    cache = build_cache(Frames(frames), CRAFT, tmp_path, 96)
+    for row, frame in enumerate(frames):
+        truth = frame.keypoints_px(POINTS)
+        expected = craft_window(frame, box_of(frame), 96).to_input(truth)
+        np.testing.assert_allclose(cache.points_px[row], expected, atol=1e-3)
+        np.testing.assert_array_equal(cache.in_view[row], frame.camera.contains(truth))
+    assert not cache.in_view.all()
+
+
+def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -> None:
+    """One turn, scale and shift takes the points of the cache to those of the sample, row by row, to a thousandth."""
+    cache = build_cache(Frames([a_frame((3.0, 0.5, 12.0), 256), a_frame(size=256)]), CRAFT, tmp_path, 96)
+    masked = 0
+    for seed in range(20):
+        row = seed % 2
+        sample = draw_keypoints(np.random.default_rng(seed), cache, row, 64)
+        seen = sample.weight > 0
+        assert seen.sum() > 4
+        assert not seen[~cache.in_view[row]].any()
+        before, after = (points[seen] @ (1, 1j) for points in (cache.points_px[row], sample.points_px))
+        similarity = np.stack([before, np.ones(len(before))], axis=1)
+        fitted = similarity @ np.linalg.lstsq(similarity, after, rcond=None)[0]
+        assert np.abs(fitted - after).max() < 1e-3
+        masked += (~seen).sum()
+    assert masked > 20
+
+
 def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
     for frames in ([], [a_frame((40.0, 0.0, 12.0), 64)]):
         with pytest.raises(GknetError, match="cache"):
@@ -120,10 +151,30 @@ def loader(folder: Path, draw=draw_keypoints, **options: int) -> Loader:
 
 
 def test_an_epoch_shows_every_row_once(folder: Path) -> None:
-    items = loader(folder)
-    for epoch in range(3):
-        assert sorted(items._order(epoch)) == list(range(12))
-    assert not np.array_equal(items._order(0), items._order(1))
+    """Twelve rows in batches of five: the last, partial batch of an epoch goes on into the next epoch."""
+    shown: list[int] = []
+
+    def draw(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
+        shown.append(row)
+        return draw_keypoints(rng, cache, row, size)
+
+    items = loader(folder, draw)
+    for position in range(0, 60, 5):
+        items.batch(position, Stage(1, 64, 5))
+    epochs = [shown[start : start + 12] for start in range(0, 60, 12)]
+    assert all(sorted(rows) == list(range(12)) for rows in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_a_batch_is_its_samples_in_order(folder: Path) -> None:
+    for draw in (draw_keypoints, draw_box):
+        items = loader(folder, draw)
+        batch = items.batch(3, Stage(1, 64, 4))
+        for k in range(4):
+            sample = items.sample(3 + k, 64)
+            np.testing.assert_array_equal(batch.image[k], sample.image)
+            np.testing.assert_array_equal(batch.points_px[k], sample.points_px)
+            np.testing.assert_array_equal(batch.weight[k], sample.weight)
 
 
 def test_a_batch_depends_on_its_position_only(folder: Path) -> None:
@@ -169,6 +220,15 @@ def test_the_network_sees_what_the_points_say(folder: Path) -> None:
     assert seen.float().mean() > 0.8
     assert (batch.points_px[seen] >= 0).all()
     assert (batch.points_px[seen] <= 128).all()
+
+
+def test_a_box_lies_about_the_craft_of_its_own_picture(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gknet.training.batch.photometric", lambda rng, image, ranges: image)
+    batch = loader(folder, draw_box).batch(0, Stage(1, 96, 12))
+    for image, corners in zip(batch.image.numpy(), batch.points_px.numpy(), strict=True):
+        rows, columns = np.nonzero(image.max(axis=2) > 25)
+        lit = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        np.testing.assert_allclose(corners.ravel(), lit, atol=5)
 
 
 def test_boxes_are_corners_in_order_inside_the_input(folder: Path) -> None:

@@ -7,6 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+
 from gknet.decode import SPREAD_CELLS, decode_heatmaps, decode_locator  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS  # noqa: E402
 from gknet.training.loss import (  # noqa: E402
@@ -29,6 +31,25 @@ def test_targets_are_gaussians_about_sub_pixel_centres() -> None:
     assert targets[0, 0].argmax().item() == i * 64 + j
     half_a_pixel = gaussian_targets(points + 0.5, 4, 64, 64, 1.5)
     assert (targets - half_a_pixel).abs().max() > 0.01
+
+
+class Counted(TorchDispatchMode):
+    """How many operations torch was asked for."""
+
+    operations = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.operations += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_targets_are_drawn_at_once_however_many_there_are() -> None:
+    counts = []
+    for batch, keypoints in ((1, 1), (8, 20)):
+        with Counted() as counted:
+            gaussian_targets(torch.rand(batch, keypoints, 2) * 64, 4, 16, 16, 1.5)
+        counts.append(counted.operations)
+    assert counts[0] == counts[1]
 
 
 def test_the_decoder_expects_the_width_that_is_trained() -> None:

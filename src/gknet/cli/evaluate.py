@@ -41,7 +41,7 @@ def evaluate(
     title = f"Pose of {estimator.spacecraft.name} on {data.resolve().name}"
     written = write_report(out, title, [section], section.evaluation.to_dict())
     Console().print(metric_table(section.evaluation))
-    tell_passed_over(section.evaluation)
+    tell_gaps(section.evaluation)
     for path in written:
         typer.echo(f"wrote {path}")
 
@@ -75,8 +75,12 @@ def write_report(out: Path, title: str, sections: list[Section], content: dict[s
     return metrics_path, page_path
 
 
-def tell_passed_over(evaluation: Evaluation) -> None:
-    """One line for the frames that are in no mean."""
+def tell_gaps(evaluation: Evaluation) -> None:
+    """One line for each thing that the dataset does not say, and one for the frames that are in no mean."""
+    from gknet.evaluation import UNKNOWN_WORDS
+
+    for column in evaluation.unknown:
+        typer.echo(f"unknown, no column '{column}': {UNKNOWN_WORDS[column]}")
     bad = evaluation.passed_over
     if bad:
         typer.echo(f"{len(bad)} frames were passed over; the first, {bad[0].name}: {bad[0].reason}")

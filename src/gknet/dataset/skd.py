@@ -27,7 +27,6 @@ class Extras:
     """What SKD rows say beyond a Frame; None where the folder does not say.
 
     index   the frame's place in its sequence, from 0
-    earth   whether the Earth is in the picture
     """
 
     index: int
@@ -36,7 +35,6 @@ class Extras:
     image_path: Path
     mask_path: Path | None
     depth_path: Path | None
-    earth: bool | None
     recipe: str | None
     seed: int | None
 
@@ -100,12 +98,12 @@ class SkdDataset(Sequence[Frame]):
         pixels = read_image(sequence.image_path(annotation.index)) if image else None
         camera = annotation.camera
         if camera is None:
-            height, width = pixels.shape[:2] if pixels is not None else self._size(self._rows[i][0])
+            height, width = self._size(self._rows[i][0])
             camera = Camera(sequence.camera_matrix, width, height)
         if pixels is not None and pixels.shape[:2] != (camera.height, camera.width):
             raise GknetError(
-                f"{sequence.image_path(annotation.index)}: expected {camera.width} x {camera.height} pixels by its "
-                f"label, got {pixels.shape[1]} x {pixels.shape[0]}"
+                f"{sequence.image_path(annotation.index)}: expected {camera.width} x {camera.height} pixels as in "
+                f"its label or its sequence, got {pixels.shape[1]} x {pixels.shape[0]}"
             )
         return Frame(
             name=f"{sequence.folder.name}/{frame_stem(annotation.index)}",
@@ -115,6 +113,7 @@ class SkdDataset(Sequence[Frame]):
             visible=annotation.visible,
             sun_direction=annotation.sun_direction,
             time_s=annotation.time_s,
+            earth_in_view=annotation.earth,
         )
 
     def extras(self, i: int) -> Extras:
@@ -129,7 +128,6 @@ class SkdDataset(Sequence[Frame]):
             image_path=sequence.image_path(annotation.index),
             mask_path=mask_path if mask_path.exists() else None,
             depth_path=depth_path if depth_path.exists() else None,
-            earth=annotation.earth,
             recipe=annotation.recipe,
             seed=annotation.seed,
         )
@@ -143,10 +141,19 @@ class SkdDataset(Sequence[Frame]):
     def _size(self, s: int) -> tuple[int, int]:
         """Height and width of a sequence's images, where only the images know them."""
         if s not in self._sizes:
-            sequence = self._sequences[s]
-            height, width = read_image(sequence.image_path(sequence.indices[0])).shape[:2]
-            self._sizes[s] = height, width
+            self._sizes[s] = _first_size(self._sequences[s])
         return self._sizes[s]
+
+
+def _first_size(sequence: SkdSequence) -> tuple[int, int]:
+    """Height and width of the first image that can be read."""
+    for index in sequence.indices:
+        try:
+            height, width = read_image(sequence.image_path(index)).shape[:2]
+        except GknetError:
+            continue
+        return height, width
+    raise GknetError(f"{sequence.folder / 'image'}: no image can be read, so their size is unknown")
 
 
 def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
@@ -172,7 +179,7 @@ def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
 def _read_split(path: Path) -> list[tuple[str, str]]:
     try:
         listing = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise GknetError(f"{path}: cannot read the split file ({error})") from error
     lists = listing.values() if isinstance(listing, dict) else [None]
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
@@ -205,8 +212,10 @@ def _declared_spacecraft(root: Path, category: str) -> Spacecraft | None:
 
 def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
     points = sequence.points_m
-    skeleton = read_skeleton(sequence.folder, len(points))
     span = np.linalg.norm(points[:, None] - points[None], axis=2)
+    if len(points) < 4 or span.max() < SAME_POINT_M:
+        raise GknetError(f"{sequence.folder / 'keypoints.txt'}: expected 4 keypoints or more, apart from each other")
+    skeleton = read_skeleton(sequence.folder, len(points))
     return Spacecraft(
         name=sequence.category,
         keypoint_names=skeleton.keypoint_names,

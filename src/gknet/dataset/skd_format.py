@@ -26,6 +26,9 @@ SPLITS = ("train", "val", "test")
 AUTHORS_COLUMNS = ("category", "position", "orientation")
 OUR_COLUMNS = ("frame", "time_s", "visible", "sun_direction", "earth", "camera", "recipe", "seed")
 
+LONGEST_SHOWN = 80
+"""Characters of a bad cell that an error quotes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
@@ -117,16 +120,21 @@ def row_of(annotation: Annotation) -> dict[str, str]:
     }
 
 
+def shown(text: str) -> str:
+    """A cell in an error's words, cut when it is long."""
+    return repr(text) if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]!r}..."
+
+
 def _numbers(row: dict[str, str], column: str, count: int | None, place: str) -> Float[ndarray, "n"]:
     """The finite numbers of a cell such as "[1, 2, 3]"."""
     text = row[column]
     expected = f"{count} numbers" if count else "numbers"
     try:
         values = np.array(ast.literal_eval(text.strip()), dtype=float)
-    except (ValueError, SyntaxError, TypeError, AttributeError, MemoryError, RecursionError) as error:
-        raise GknetError(f"{place}: {column}: expected a list of {expected}, got {text!r}") from error
+    except (ValueError, SyntaxError, TypeError, OverflowError, MemoryError, RecursionError) as error:
+        raise GknetError(f"{place}: {column}: expected a list of {expected}, got {shown(text)}") from error
     if values.ndim != 1 or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        raise GknetError(f"{place}: {column}: expected {expected}, all finite, got {text!r}")
+        raise GknetError(f"{place}: {column}: expected {expected}, all finite, got {shown(text)}")
     return values
 
 
@@ -137,7 +145,7 @@ def _number(row: dict[str, str], column: str, place: str) -> float | None:
     try:
         value = float(text)
     except ValueError as error:
-        raise GknetError(f"{place}: {column}: expected a number, got {text!r}") from error
+        raise GknetError(f"{place}: {column}: expected a number, got {shown(text)}") from error
     if not np.isfinite(value):
         raise GknetError(f"{place}: {column}: expected a finite number, got {text!r}")
     return value
@@ -145,10 +153,12 @@ def _number(row: dict[str, str], column: str, place: str) -> float | None:
 
 def _camera(row: dict[str, str], place: str) -> Camera:
     fx, fy, cx, cy, width, height = _numbers(row, "camera", 6, place)
+    if width % 1 or height % 1:
+        raise GknetError(f"{place}: camera: expected a width and height in whole pixels, got {shown(row['camera'])}")
     try:
         return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height))
     except GknetError as error:
-        raise GknetError(f"{place}: {error}") from error
+        raise GknetError(f"{place}: camera: {error}") from error
 
 
 def _pose(row: dict[str, str], place: str) -> Pose:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import pickle
+import operator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_matrix, from_skd_points
-from gknet.errors import GknetError, MissingExtraError
+from gknet.errors import GknetError
+from gknet.torch_file import load_torch_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +80,17 @@ def read_rows(path: Path) -> tuple[dict[str, str], ...]:
 
 
 def _indices(folder: Path, rows: tuple[dict[str, str], ...]) -> tuple[int, ...]:
-    """The frame of each row: its `frame` cell, else the image of the same rank."""
+    """The frame of each row: its `frame` cell, else, as with the authors, row i is frame i. Pictures may be lost."""
     path = folder / "annotations.csv"
     if rows and "frame" in rows[0]:
         for number, row in enumerate(rows, start=1):
             if not row["frame"].strip().isdecimal():
                 raise GknetError(f"{path}: row {number}: frame: expected 0, 1, ..., got {row['frame']!r}")
         return tuple(int(row["frame"]) for row in rows)
-    stems = sorted(image.stem for image in (folder / "image").glob("*.jpg"))
-    if not stems:
-        return tuple(range(len(rows)))
-    if len(stems) != len(rows) or not all(stem.isdecimal() and int(stem) > 0 for stem in stems):
-        raise GknetError(f"{path}: {len(rows)} rows for {len(stems)} numbered images; add a column 'frame' (from 0)")
-    return tuple(int(stem) - 1 for stem in stems)
+    last = max((path.stem for path in (folder / "image").glob("*.jpg") if path.stem.isdecimal()), key=int, default="0")
+    if int(last) > len(rows):
+        raise GknetError(f"{path}: {len(rows)} rows, yet there is an image {last}; add a column 'frame' (from 0)")
+    return tuple(range(len(rows)))
 
 
 def read_table(path: Path) -> Float[ndarray, "n 3"]:
@@ -100,6 +99,8 @@ def read_table(path: Path) -> Float[ndarray, "n 3"]:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise GknetError(f"{path}: cannot read the table ({error})") from error
+    if not lines:
+        raise GknetError(f"{path}: expected rows of three numbers, found none")
     table = np.empty((len(lines), 3))
     for number, line in enumerate(lines, start=1):
         try:
@@ -132,35 +133,23 @@ def read_skeleton(folder: Path, keypoint_count: int) -> Skeleton:
     if not path.exists():
         raise GknetError(f"{folder}: expected skeleton.json or skeleton.pth, found neither")
     names = tuple(f"keypoint_{k + 1:02d}" for k in range(keypoint_count))
-    return Skeleton(names, _edges(path, _read_torch_skeleton(path), keypoint_count))
+    return Skeleton(names, _edges(path, load_torch_file(path), keypoint_count))
 
 
 def _read_json_skeleton(path: Path, keypoint_count: int) -> Skeleton:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         names, edges = tuple(content["keypoint_names"]), content["edges"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise GknetError(f"{path}: expected the keys keypoint_names and edges ({error!r})") from error
     if len(names) != keypoint_count or not all(isinstance(name, str) for name in names):
         raise GknetError(f"{path}: expected {keypoint_count} keypoint names as in keypoints.txt, got {len(names)}")
     return Skeleton(names, _edges(path, edges, keypoint_count))
 
 
-def _read_torch_skeleton(path: Path) -> object:
-    try:
-        import torch
-    except ImportError as error:
-        raise MissingExtraError("train", "torch") from error
-    try:
-        return torch.load(path, weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise GknetError(f"{path}: cannot read the skeleton ({reason})") from error
-
-
 def _edges(path: Path, edges: object, keypoint_count: int) -> tuple[tuple[int, int], ...]:
     try:
-        pairs = tuple((int(i), int(j)) for i, j in edges)  # type: ignore[attr-defined]
+        pairs = tuple((operator.index(i), operator.index(j)) for i, j in edges)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
         raise GknetError(f"{path}: expected a list of pairs of keypoint indices") from error
     for i, j in pairs:

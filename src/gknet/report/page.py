@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 
 from gknet import __version__
-from gknet.evaluation import PROTOCOL_WORDS, Evaluation, Run
+from gknet.evaluation import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, Run
 from gknet.metrics import Statistic
 from gknet.report.gallery import Gallery
 from gknet.report.plots import charts
@@ -54,9 +54,11 @@ def _section(section: Section) -> str:
     evaluation = section.evaluation
     name = escape(evaluation.spacecraft.name)
     first = evaluation.runs[0].summary
-    words = f"{evaluation.data}: {first.frames} frames of {first.sequences} sequences"
+    words = [f"{evaluation.data}: {first.frames} frames of {first.sequences} sequences"]
+    words += [f"Unknown: {UNKNOWN_WORDS[column]}." for column in evaluation.unknown]
+    lines = "".join(f'<p class="quiet">{escape(line)}</p>' for line in words)
     return (
-        f'<section id="{name}"><h2>{name}</h2><p class="quiet">{escape(words)}</p>'
+        f'<section id="{name}"><h2>{name}</h2>{lines}'
         f"{_cards(evaluation)}{_metric_table(evaluation)}{_failures(evaluation)}"
         f'<h3>Charts</h3><div class="charts">{"".join(charts(evaluation))}</div>'
         f"{''.join(_gallery(gallery) for gallery in section.galleries)}</section>"

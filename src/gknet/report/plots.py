@@ -30,6 +30,8 @@ def charts(evaluation: Evaluation) -> list[str]:
     for by, words, label, unit in conditions:
         drawn.append(_by_condition(evaluation, by, f"RMSE by {words}", label, "rmse_px", "mean RMSE in px", unit))
         drawn.append(_by_condition(evaluation, by, f"E_q by {words}", label, "e_q_rad", "mean E_q in rad", unit))
+    drawn.append(_by_background(evaluation, "RMSE by background", "rmse_px", "mean RMSE in px"))
+    drawn.append(_by_background(evaluation, "E_q by background", "e_q_rad", "mean E_q in rad"))
     return drawn
 
 
@@ -68,6 +70,20 @@ def _binned(run: Run, by: str, metric: str, unit: Callable[[float], float]) -> S
         np.array([statistic.low for statistic in found]),
         np.array([statistic.high for statistic in found]),
     )
+
+
+def _by_background(evaluation: Evaluation, title: str, metric: str, value: str) -> str:
+    """Black sky beside Earth in view; empty where the labels do not say."""
+    series = []
+    for run in evaluation.runs:
+        found = {b.low > 0: b.metrics[metric] for b in run.summary.bins if b.by == "earth_in_view"}
+        both = [found.get(earth) for earth in (False, True)]
+        mean, low, high = (
+            np.array([np.nan if statistic is None else getattr(statistic, name) for statistic in both])
+            for name in ("mean", "low", "high")
+        )
+        series.append(Series(PROTOCOL_WORDS[run.protocol], np.arange(2.0), mean, low, high))
+    return bar_chart(title, Axis(f"{value}, 95 % interval", low=0.0), ("black sky", "Earth in view"), series)
 
 
 def _middle(run: Run, bin_: Bin) -> float:

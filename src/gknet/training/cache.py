@@ -84,7 +84,11 @@ def _label_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size
     digest = hashlib.sha256(f"{LAYOUT} {window} {size} {MARGIN} {WHOLE} {stamp}".encode())
     digest.update(np.append(spacecraft.points_m, spacecraft.diameter_m).tobytes())
     for i in range(len(frames)):
-        frame = frames.frame(i, image=False)
+        try:
+            frame = frames.frame(i, image=False)
+        except GknetError as error:  # a bad label: the frame is left out, and reported when the cache is written
+            digest.update(str(error).encode())
+            continue
         digest.update(f"{frame.name} {frame.camera.width} {frame.camera.height}".encode())
         digest.update(frame.camera.matrix.tobytes())
         if frame.cam_from_body is not None:

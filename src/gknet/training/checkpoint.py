@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from gknet.atomic import write_bytes
 from gknet.errors import GknetError
+from gknet.torch_file import load_torch_file
 
 CHECKPOINT = "checkpoint.pt"
 BEST = "best.safetensors"
@@ -61,19 +62,27 @@ def load_checkpoint(
     path = folder / CHECKPOINT
     if not path.exists():
         raise GknetError(f"{path}: no checkpoint to resume from; leave out --resume to start anew")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises whatever its unpickler meets
-        raise GknetError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]})") from error
+    content = load_torch_file(path)
+    if not isinstance(content, dict) or "identity" not in content:
+        raise GknetError(f"{path}: not a checkpoint of 'gknet train'")
     if content["identity"] != identity:
         raise GknetError(f"{path}: it is of another training ({content['identity']}; now {identity})")
-    network.load_state_dict(content["network"])
-    average.load_state_dict(content["average"])
-    optimizer.load_state_dict(content["optimizer"])
-    torch.set_rng_state(content["torch_rng"])
-    if torch.cuda.is_available() and content["cuda_rng"]:
-        torch.cuda.set_rng_state_all(content["cuda_rng"])
-    return State(**content["state"])
+    try:
+        network.load_state_dict(content["network"])
+        average.load_state_dict(content["average"])
+        optimizer.load_state_dict(content["optimizer"])
+        torch.set_rng_state(content["torch_rng"])
+        if torch.cuda.is_available() and content["cuda_rng"]:
+            torch.cuda.set_rng_state_all(content["cuda_rng"])
+        return State(**content["state"])
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # a part is missing or of another kind
+        raise GknetError(f"{path}: it does not fit this training ({error!r})") from error
 
 
 def save_weights(path: Path, weights: Mapping[str, Tensor], metadata: Mapping[str, object]) -> None:

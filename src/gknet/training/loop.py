@@ -33,7 +33,7 @@ from gknet.training.progress import Teller
 from gknet.training.schedule import Budget, learning_rate, stage_at
 from gknet.training.settings import Run, TrainSettings
 from gknet.training.setup import check_cameras, make_fabric, make_optimizer, make_task, open_cache, update_average
-from gknet.training.validation import validation_rows
+from gknet.training.validation import usable_rows, validation_rows
 
 REPORT_STEPS = 50
 CHECKPOINT_S = 120.0
@@ -66,16 +66,15 @@ def train(
     spacecraft = training_data.spacecraft
     fabric = make_fabric(settings)
     torch.manual_seed(settings.seed)
-    rows = validation_rows(len(val_data), settings.val_frames)
-    out.mkdir(parents=True, exist_ok=True)
-    with fabric.rank_zero_first():
-        cache = open_cache(training_data, settings, cache_folder or data / "cache", fabric.print)
-
     network = build(settings.network, spacecraft.adjacency, settings.graph, settings.chosen_loss)
     if settings.init is not None and not resume:
         taken, total = warm_start(network, settings.init)
         fabric.print(f"{settings.init}: {taken} of {total} tensors taken")
     check_cameras(network, training_data)
+    rows = usable_rows(val_data, validation_rows(len(val_data), settings.val_frames), spacecraft, fabric.print)
+    with fabric.rank_zero_first():
+        cache = open_cache(training_data, settings, cache_folder or data / "cache", fabric.print)
+
     task = make_task(network, spacecraft, settings)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network).to(fabric.device).eval()
@@ -98,6 +97,7 @@ def train(
         state.best,
     )
     budget = Budget(settings.minutes, None if settings.epochs is None else round(settings.epochs * len(cache)))
+    out.mkdir(parents=True, exist_ok=True)
     stages = settings.input_stages
     started = time.monotonic() - state.elapsed_s
     loader = Loader(cache, task.draw, settings.seed, fabric.global_rank, fabric.world_size)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from gknet.atomic import write_text
 from gknet.errors import GknetError
@@ -113,7 +116,7 @@ class Run:
     network: str
     graph: str
     loss: str
-    input_size: int
+    input_size: Annotated[int, Field(gt=0, multiple_of=32)]
     spacecraft_toml: str
     settings: dict[str, object]
     version: str
@@ -137,4 +140,8 @@ def load_run(folder: Path) -> Run:
     names = {field.name for field in fields(Run)}
     if not isinstance(values, dict) or set(values) != names:
         raise GknetError(f"{path}: expected the keys {', '.join(sorted(names))}")
-    return Run(**values)
+    try:
+        return TypeAdapter(Run).validate_python(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise GknetError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -76,7 +76,10 @@ def check_cameras(network: Network, frames: FrameSource) -> None:
     if not isinstance(network, DMANet):
         return
     for i in range(len(frames)):
-        frame = frames.frame(i, image=False)
+        try:
+            frame = frames.frame(i, image=False)
+        except GknetError:  # a bad label is left out by the cache
+            continue
         ratio = frame.camera.matrix[0, 0] / frame.camera.matrix[1, 1]
         if abs(ratio - 1) > SQUARE:
             raise GknetError(
@@ -103,12 +106,20 @@ def update_average(average: nn.Module, network: nn.Module, keep: float) -> None:
             a.copy_(n)
 
 
+def _stamp(data: SkdDataset, row: int) -> str:
+    """Size and time of a frame's picture; nothing where its label or its picture is missing."""
+    try:
+        file = data.extras(row).image_path.stat()
+    except (GknetError, OSError):
+        return ""
+    return f"{file.st_size}:{file.st_mtime_ns}"
+
+
 def open_cache(data: SkdDataset, settings: TrainSettings, folder: Path, say: Callable[[str], None]) -> Cache:
     """The decoded crops of `data`, built under `folder` if they are not there."""
     from gknet.progress import progress
 
-    files = [data.extras(row).image_path.stat() for row in validation_rows(len(data), STAMPED)]
-    stamp = " ".join(f"{file.st_size}:{file.st_mtime_ns}" for file in files)
+    stamp = " ".join(_stamp(data, row) for row in validation_rows(len(data), STAMPED))
     size = PICTURE_SIZE if settings.window == "picture" else settings.cache_size
     with progress() as bar:
         task = bar.add_task("decoding", total=len(data))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,19 +42,29 @@ def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray
     return run
 
 
-def _usable(frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft) -> list[Frame]:
-    """The frames that can be read and that show the craft."""
-    usable = []
+def _usable(
+    frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft, report: Callable[[str], None]
+) -> Iterator[tuple[int, Frame]]:
+    """The rows and frames that can be read and that show the craft, one at a time; the others are reported."""
+    found = 0
     for row in rows:
         try:
             frame = frames[row]
             metrics.oracle_crop(frame, spacecraft)
-        except GknetError:
+        except GknetError as error:
+            report(f"left out: {error}")
             continue
-        usable.append(frame)
-    if not usable:
+        found += 1
+        yield row, frame
+    if not found:
         raise GknetError("validation: no frame of the val split can be read and shows the spacecraft")
-    return usable
+
+
+def usable_rows(
+    frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft, report: Callable[[str], None]
+) -> list[int]:
+    """The rows that a validation can use, looked at before the training begins."""
+    return [row for row, _ in _usable(frames, rows, spacecraft, report)]
 
 
 def validation_rows(count: int, wanted: int) -> list[int]:
@@ -74,7 +84,7 @@ def validate_keypoints(
     network.eval()
     looking = Looking(input_size=input_size)
     bare = Estimator(numpy_network(network, device), spacecraft, looking=looking, decoding=BARE)
-    sights = [sight(frame, bare, network.stride) for frame in _usable(frames, rows, spacecraft)]
+    sights = [sight(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
     try:
         estimator = calibrated(bare, sights)
     except GknetError:  # nothing was sure enough yet
@@ -113,7 +123,7 @@ def validate_direct(
     looking = Looking(input_size=input_size)
     estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, looking=looking)
     errors = []
-    for frame in _usable(frames, rows, spacecraft):
+    for _, frame in _usable(frames, rows, spacecraft, print):
         assert frame.image is not None
         estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(spacecraft.points_m))
         errors.append(metrics.errors(frame, estimate, spacecraft))
@@ -134,7 +144,7 @@ def validate_locator(
     run = numpy_network(network, device)
     estimator = Estimator(run, spacecraft, locator=run, looking=Looking(locator_size=input_size))
     overlaps = []
-    for frame in _usable(frames, rows, spacecraft):
+    for _, frame in _usable(frames, rows, spacecraft, print):
         assert frame.image is not None
         true_box, found = frame.true_box(spacecraft.points_m), estimator.locate(frame.image)
         overlaps.append(0.0 if found is None or true_box is None else found.iou(true_box))

@@ -1,0 +1,23 @@
+"""Files written by torch.save, read as data: whatever else a pickle holds is refused and never run."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from gknet.errors import GknetError, MissingExtraError
+
+
+def load_torch_file(path: Path) -> object:
+    """Tensors on the CPU, numbers, texts, lists and dicts of them; GknetError for anything else."""
+    try:
+        import torch
+    except ImportError as error:
+        raise MissingExtraError("train", "torch") from error
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise GknetError(f"{path}: cannot be read ({error})") from error
+    except Exception as error:  # torch.load raises whatever its unpickler meets
+        raise GknetError(f"{path}: not readable: it is damaged, or holds more than data and is not loaded") from error
