@@ -41,7 +41,8 @@ def noise_cache(spacecraft: Spacecraft, count: int = 512, size: int = 320) -> Ca
     points = rng.uniform(0.2 * size, 0.8 * size, (count, spacecraft.keypoint_count, 2)).astype(np.float32)
     boxes = np.concatenate([points.min(axis=1), points.max(axis=1)], axis=1)
     images = rng.integers(0, 256, (count, size, size, 3), dtype=np.uint8)
-    return Cache(images, points, np.ones(points.shape[:2], dtype=bool), boxes)
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float32), (count, 1))
+    return Cache(images, points, np.ones(points.shape[:2], dtype=bool), boxes, poses)
 
 
 def stepper(network_name: str, spacecraft: Spacecraft, averaged: bool) -> Callable[[Batch], None]:
