@@ -126,6 +126,7 @@ class Keypoints:
 class Estimate:
     """The answer for one image. `failure` says why there is no pose, and is None exactly when there is one.
 
+    keypoints    as detected; of a direct estimator, which detects none, where its pose puts them
     covariance   (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
                  R_true = exp([dw]x) R, t_true = t + dt
     inliers      (n,) bool: keypoints that the pose agrees with
