@@ -37,6 +37,8 @@ from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
 
 DATA_SEED, TRAINING_SEED = 0, 1
+LEARNING_RATE = 1e-3
+"""Of weights that are trained on: half the default, which would undo much of what they know."""
 FIRST_STAGES = (Stage(0.55, 128, 16), Stage(0.25, 192, 16), Stage(0.20, 256, 16))
 KEYPOINT_STAGES = (Stage(0.5, 128, 16), Stage(0.5, 192, 16))
 FULL_STAGES = (Stage(0.4, 128, 32), Stage(0.2, 192, 32), Stage(0.4, 256, 32))
@@ -116,17 +118,16 @@ def train_all(work: Path, scale: Scale, start: Path | None) -> None:
     runs = work / "runs"
     first = runs / "first"
     if start is None:
-        run((work, "crops", NAMES[0], first, keypoint_settings(scale.first_minutes, FIRST_STAGES, None)), quiet=False)
+        settings = run_settings("gknet-s", scale.first_minutes, 6, None, FIRST_STAGES)
+        run((work, "crops", NAMES[0], first, settings), quiet=False)
     keypoints: list[Job] = []
     locators: list[Job] = []
     for name, minutes in zip(NAMES, scale.keypoint_minutes, strict=True):
         init = first / BEST if start is None else start / name / "keypoints.safetensors"
-        settings = keypoint_settings(minutes, scale.stages, init)
+        settings = run_settings("gknet-s", minutes, 6, init, scale.stages)
         keypoints.append((work, "crops", name, runs / f"{name}_keypoints", settings))
         init = None if start is None else start / name / "locator.safetensors"
-        settings = TrainSettings(
-            "locator", minutes=scale.locator_minutes, validations=3, val_frames=200, seed=TRAINING_SEED, init=init
-        )
+        settings = run_settings("locator", scale.locator_minutes, 3, init)
         locators.append((work, "pictures", name, runs / f"{name}_locator", settings))
     threads = max(1, (os.cpu_count() or 1) // scale.jobs)
     context = multiprocessing.get_context("spawn")
@@ -143,9 +144,18 @@ def run(job: Job, quiet: bool = True) -> str:
     return f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min, best {state.best}"
 
 
-def keypoint_settings(minutes: float, stages: tuple[Stage, ...], init: Path | None) -> TrainSettings:
+def run_settings(
+    network: str, minutes: float, validations: int, init: Path | None, stages: tuple[Stage, ...] | None = None
+) -> TrainSettings:
     return TrainSettings(
-        "gknet-s", minutes=minutes, stages=stages, validations=6, val_frames=200, seed=TRAINING_SEED, init=init
+        network,
+        minutes=minutes,
+        stages=stages,
+        learning_rate=TrainSettings.learning_rate if init is None else LEARNING_RATE,
+        validations=validations,
+        val_frames=200,
+        seed=TRAINING_SEED,
+        init=init,
     )
 
 
