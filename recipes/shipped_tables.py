@@ -65,8 +65,8 @@ def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
     lines += [
-        "Trained on rendered pictures alone (recipe `skd`, seed 0) by `recipes/shipped_models.py`; the README of",
-        "the package says how. Keypoint errors in pixels of the 256 crop.",
+        "Trained on rendered pictures alone (recipe `skd` with 4,500 sequences, seed 0) by `recipes/shipped_models.py`;",
+        "the README of the package says how. Keypoint errors in pixels of the 256 crop.",
         "",
     ]
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
