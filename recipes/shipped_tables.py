@@ -65,7 +65,7 @@ def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
     lines += [
-        "Trained on rendered pictures alone (recipe `skd` with 4,500 sequences, seed 0) by `recipes/shipped_models.py`;",
+        "Trained on rendered pictures alone (recipe `skd`, 4,500 sequences, seed 0) by `recipes/shipped_models.py`;",
         "the README of the package says how. Keypoint errors in pixels of the 256 crop.",
         "",
     ]
