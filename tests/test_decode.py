@@ -154,7 +154,7 @@ def test_decoding_takes_about_a_millisecond() -> None:
     heatmaps = gaussians(np.random.default_rng(6).uniform(5, 59, (24, 2)))
     times = []
     for _ in range(50):
-        start = time.perf_counter()
+        start = time.process_time()
         decode_heatmaps(heatmaps, STRIDE)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     assert np.median(times) < 5e-3

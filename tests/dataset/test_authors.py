@@ -133,7 +133,7 @@ def test_a_folder_of_theirs_reads_as_it_was_written(tmp_path: Path) -> None:
             assert (frame.camera.width, frame.camera.height) == (SIZE, SIZE)
             assert frame.visible is frame.sun_direction is frame.time_s is None
             extras = dataset.extras(i)
-            assert extras.earth is extras.recipe is extras.seed is extras.mask_path is extras.depth_path is None
+            assert frame.earth_in_view is extras.recipe is extras.seed is extras.mask_path is extras.depth_path is None
     for record in authors.read(tmp_path, SIZE):
         dataset = SkdDataset(tmp_path, record.split)
         i = int(record.image_path.stem) - 1
