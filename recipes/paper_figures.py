@@ -13,6 +13,7 @@ Expected   keypoints.jpg and overlays.jpg from the bundled frames; detections.jp
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import cv2
@@ -145,4 +146,5 @@ if __name__ == "__main__":
     try:
         main()
     except GknetError as error:
-        raise SystemExit(f"error: {error}") from error
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

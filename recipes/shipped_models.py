@@ -21,6 +21,7 @@ import argparse
 import multiprocessing
 import os
 import shutil
+import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from torch import Tensor
 
 from gknet.cli.evaluate import evaluate
 from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
 from gknet.fleet import NAMES
 from gknet.network.build import build
 from gknet.render.generate import generate
@@ -158,6 +160,13 @@ def run_settings(
     )
 
 
+def check_start(start: Path | None) -> None:
+    """Before hours of rendering, not after them."""
+    for name in NAMES if start is not None else ():
+        for kind in ("keypoints", "locator"):
+            load_weights(start / name / f"{kind}.safetensors")
+
+
 def train_all(work: Path, scale: Scale, start: Path | None) -> None:
     """Every network, `scale.jobs` at a time."""
     if start is None:
@@ -246,6 +255,7 @@ def main() -> None:
     parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")
     arguments = parser.parse_args()
     scale = SCALES[arguments.scale]
+    check_start(arguments.start)
     render(arguments.work, scale)
     train_all(arguments.work, scale, arguments.start)
     ship(arguments.work, arguments.out)
@@ -253,4 +263,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except GknetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

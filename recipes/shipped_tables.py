@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import onnxruntime
 
 from gknet.atomic import write_text
+from gknet.errors import GknetError
 from gknet.fleet import NAMES
 from gknet.onnx_network import METADATA_KEY
 
@@ -30,6 +32,15 @@ COLUMNS = {
     "speed_score": "SPEED score",
     "add": "ADD, diameters",
 }
+
+
+def figures(results: Path, name: str, recipe: str) -> dict[str, Any]:
+    """The runs of a spacecraft's metrics.json, by crop."""
+    path = results / f"{name}_{recipe}.json"
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["runs"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GknetError(f"{path}: not the figures of recipes/shipped_models.py ({error})") from error
 
 
 def statistic(run: dict[str, Any], name: str) -> str:
@@ -50,7 +61,7 @@ def table(results: Path, recipe: str) -> str:
         "|---" * (len(shown) + 5) + "|",
     ]
     for name in NAMES:
-        runs = json.loads((results / f"{name}_{recipe}.json").read_text(encoding="utf-8"))["runs"]
+        runs = figures(results, name, recipe)
         for protocol, words in PROTOCOLS.items():
             run = runs[protocol]
             located = "" if protocol == "oracle" else f"{100 * run['located_07']:.1f} %"
@@ -58,6 +69,22 @@ def table(results: Path, recipe: str) -> str:
             cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
             cells += [f"{mean:.3g}, {median:.3g}" for mean, median in pairs]
             lines.append("| " + " | ".join([*cells, f"{100 * run['coverage_95']:.0f} %", located]) + " |")
+    return "\n".join(lines)
+
+
+def background_table(results: Path, recipe: str) -> str:
+    """Markdown: mean, median RMSE of the oracle crop, by what is behind the spacecraft."""
+    lines = [
+        "| spacecraft, oracle crop | black sky, frames: RMSE px | Earth in view, frames: RMSE px |",
+        "|---" * 3 + "|",
+    ]
+    for name in NAMES:
+        bins = {b["low"] > 0: b for b in figures(results, name, recipe)["oracle"]["bins"] if b["by"] == "earth_in_view"}
+        cells = [name]
+        for earth in (False, True):
+            rmse = bins[earth]["metrics"]["rmse_px"] if earth in bins else None
+            cells.append("none" if rmse is None else f"{rmse['frames']}: {rmse['mean']:.3g}, {rmse['median']:.3g}")
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -78,7 +105,7 @@ def card(models: Path, results: Path, name: str) -> str:
         size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
         lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
     for recipe in ("skd", "skd-hard"):
-        runs = json.loads((results / f"{name}_{recipe}.json").read_text(encoding="utf-8"))["runs"]
+        runs = figures(results, name, recipe)
         lines += ["", f"## {recipe}, test sequences: mean [95 % interval over sequences], median", ""]
         lines += ["| | " + " | ".join(PROTOCOLS.values()) + " |", "|---" * 3 + "|"]
         for column, words in COLUMNS.items():
@@ -107,7 +134,12 @@ def main() -> None:
         write_text(arguments.models / name / "README.md", card(arguments.models, arguments.results, name))
     for recipe in ("skd", "skd-hard"):
         print(f"\n{recipe}: mean, median\n\n{table(arguments.results, recipe)}")
+        print(f"\n{recipe}, by background\n\n{background_table(arguments.results, recipe)}")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except GknetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

@@ -35,7 +35,7 @@ from gknet.training.settings import TrainSettings  # noqa: E402
 from gknet.training.setup import check_cameras, make_task  # noqa: E402
 from gknet.training.tasks import DirectTask  # noqa: E402
 from gknet.training.validation import validate_direct  # noqa: E402
-from tests.training.toy import POINTS, drawn, toy_spacecraft, write_toy  # noqa: E402
+from tests.training.toy import POINTS, drawn, toy_spacecraft  # noqa: E402
 
 CRAFT = toy_spacecraft()
 CACHE_SIZE, INPUT_SIZE = 160, 64
@@ -49,21 +49,6 @@ SETTINGS = TrainSettings(
     val_frames=2,
     validations=1,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("toy")
-    write_toy(root, 8, 2, 96)
-    return root
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +260,7 @@ def test_the_commands_work_with_it(data: Path, model: Path, tmp_path: Path) -> N
     assert {"e_t", "e_q_rad"} <= set(oracle["metrics"])
     for layout in ("jsonl", "csv"):
         code = command(["predict", str(data), *arguments, "--oracle", "--format", layout])
-        assert code in (0, 2)  # 2 where neither frame has a pose: it was trained on 8 pictures
+        assert code in (0, 2)  # 2 where neither frame has a pose: it was trained on 12 pictures
     line = json.loads((tmp_path / "poses.jsonl").read_text().splitlines()[0])
     assert line["status"] in ("ok", "no pose")
     assert line["covariance"] is None

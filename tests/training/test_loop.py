@@ -21,7 +21,6 @@ from gknet.training.export import export_run  # noqa: E402
 from gknet.training.loop import train  # noqa: E402
 from gknet.training.schedule import Stage  # noqa: E402
 from gknet.training.settings import TrainSettings, load_run  # noqa: E402
-from tests.training.toy import write_toy  # noqa: E402
 
 SETTINGS = TrainSettings(
     epochs=3,
@@ -32,21 +31,6 @@ SETTINGS = TrainSettings(
     val_frames=2,
     validations=1,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("toy")
-    write_toy(root, 12, 2, 96)
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,98 @@
+"""The recipe of the shipped models on drawn pictures: it trains, blends, exports, and chooses what it says it does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("lightning_fabric")
+pytest.importorskip("mitsuba")
+
+from gknet.errors import GknetError  # noqa: E402
+from gknet.estimator import load_estimator  # noqa: E402
+from gknet.render.recipe import RECIPES  # noqa: E402
+from gknet.training.checkpoint import BEST, load_weights  # noqa: E402
+from gknet.training.schedule import Stage  # noqa: E402
+
+CRAFT = "satellite_01"
+STAGES = (Stage(1.0, 64, 4),)
+RECIPES_FOLDER = Path(__file__).parents[2] / "recipes"
+
+
+@pytest.fixture
+def recipe(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(RECIPES_FOLDER))
+    import shipped_models
+
+    monkeypatch.setattr(shipped_models, "NAMES", (CRAFT,))
+    monkeypatch.setattr(shipped_models, "FIRST_STAGES", STAGES)
+    return shipped_models
+
+
+@pytest.fixture
+def work(data: Path, tmp_path: Path) -> Path:
+    for folder in ("crops", "pictures", "frames"):
+        shutil.copytree(data, tmp_path / folder)
+    return tmp_path
+
+
+def test_more_sequences_have_the_splits_of_the_first(recipe: ModuleType) -> None:
+    """So what a longer recipe trains on is never of skd's val and test sequences."""
+    for scale in recipe.SCALES.values():
+        longer = RECIPES["skd"].model_copy(update={"sequences": scale.sequences})
+        for sequence in range(RECIPES["skd"].sequences):
+            assert longer.split_of(sequence) == RECIPES["skd"].split_of(sequence)
+            assert longer.spacecraft_of(sequence) == RECIPES["skd"].spacecraft_of(sequence)
+
+
+def test_a_mean_goes_from_the_old_weights_to_the_new(recipe: ModuleType) -> None:
+    before = {"w": torch.tensor([1.0, 2.0]), "count": torch.tensor(3)}
+    after = {"w": torch.tensor([5.0, 0.0]), "count": torch.tensor(9)}
+    for share, expected in ((0.0, [1.0, 2.0]), (0.25, [2.0, 1.5]), (1.0, [5.0, 0.0])):
+        found = recipe.mean(before, after, share)
+        assert found["w"].tolist() == expected
+        assert found["count"] == 9
+
+
+def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
+    scale = replace(
+        recipe.SCALES["cpu"], first_minutes=0.05, keypoint_minutes=(0.05,), locator_minutes=0.05, stages=STAGES
+    )
+    recipe.train_all(work, scale, None)
+    recipe.ship(work, work / "models")
+    assert load_estimator(work / "models" / CRAFT).locator is not None
+    assert not list((work / "blended").glob("first*"))
+
+    run = f"{CRAFT}_keypoints"
+    chosen = json.loads((work / "blended" / run / "run.json").read_text())["best"]
+    before, after = load_weights(work / "runs" / "first" / BEST), load_weights(work / "runs" / run / BEST)
+    blended = load_weights(work / "blended" / run / BEST)
+    for name, expected in recipe.mean(before, after, chosen["share"]).items():
+        torch.testing.assert_close(blended[name], expected)
+    job = next(job for job in recipe.jobs(work, scale, None) if job.run == run)
+    assert scores_of(recipe.blend(replace(job, run=run)), recipe) is None  # done before, so left alone
+    shutil.rmtree(work / "blended" / run)
+    scores = scores_of(recipe.blend(job), recipe)
+    assert scores is not None
+    assert list(scores) == list(recipe.SHARES)
+    assert scores[chosen["share"]] == min(scores.values())
+
+
+def scores_of(said: str, recipe: ModuleType) -> dict[float, float] | None:
+    """What `blend` says of each share."""
+    if "done before" in said:
+        return None
+    words = said.split(": ", 1)[1].split(", ")
+    return {float(word.split()[1]): float(word.split()[3]) for word in words}
+
+
+def test_models_to_start_from_are_looked_at_first(recipe: ModuleType, tmp_path: Path) -> None:
+    recipe.check_start(None)
+    with pytest.raises(GknetError, match=r"satellite_01/keypoints\.safetensors"):
+        recipe.check_start(tmp_path)
