@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -34,7 +35,7 @@ from gknet.report.palette import SKY, WHITE
 from gknet.spacecraft import Spacecraft
 
 SIDE = 512
-METHODS = {"HRNet": "hrnet-s", "ResUNet": "resunet-s", "GKNet": "gknet-s"}
+METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
 FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
 
@@ -98,10 +99,10 @@ def overlay_figure(place: int = 4) -> ndarray:
     return sheet([row])
 
 
-def detection_figure(work: Path, methods: dict[str, str], seed: int = 0) -> ndarray:
+def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequence[str], seed: int = 0) -> ndarray:
     """A row for each spacecraft, a column for each method: the frame of median difficulty for all of them together."""
     rows = []
-    for name in NAMES:
+    for name in spacecraft_names:
         estimators = {}
         for method, key in methods.items():
             folder = work / "models" / f"{name}_{key}_{seed}"
@@ -134,12 +135,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
     parser.add_argument("--work", type=Path, help="work folder of recipes/paper_tables.py")
     parser.add_argument("--scale", default="cpu", help="its sub-folder")
+    parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES), help="the rows of figure 3")
     arguments = parser.parse_args()
     write_jpeg(arguments.out / "keypoints.jpg", keypoint_figure())
     write_jpeg(arguments.out / "overlays.jpg", overlay_figure())
     if arguments.work is not None:
         methods = FULL_METHODS if arguments.scale == "full" else METHODS
-        write_jpeg(arguments.out / "detections.jpg", detection_figure(arguments.work / arguments.scale, methods))
+        picture = detection_figure(arguments.work / arguments.scale, methods, arguments.spacecraft)
+        write_jpeg(arguments.out / "detections.jpg", picture)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-CRAFT = "satellite_01"
-METHODS = ("gknet-s", "hrnet-s", "resunet-s", "dmanet-s", "gknet-s_identity", "gknet-s_random", "gknet-s_none")
+CRAFT = "satellite_02"
+METHODS = ("gknet-xs", "hrnet-xs", "resunet-xs", "dmanet-xs", "gknet-xs_identity", "gknet-xs_random", "gknet-xs_none")
 
 
 def recipe(name: str, *words: object) -> str:

@@ -18,14 +18,15 @@ from gknet.network.build import (  # noqa: E402
     build,
     configured,
     dmanet,
-    dmanet_s,
+    dmanet_xs,
     gknet_paper,
     gknet_s,
+    gknet_xs,
     hrnet,
-    hrnet_s,
+    hrnet_xs,
     locator,
     resunet,
-    resunet_s,
+    resunet_xs,
 )
 from gknet.network.dmanet import DMANet, DMANetConfig, MultiScaleAttention  # noqa: E402
 from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
@@ -79,8 +80,9 @@ def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
 
 def test_without_edges_the_size_is_the_same() -> None:
     assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton")) == parameters(tiny(9, "random"))
-    whole, without = parameters(gknet_s(chain(16))), parameters(gknet_s(chain(16), "none"))
-    assert abs(without / whole - 1) < 0.03
+    for network in (gknet_s, gknet_xs):
+        whole, without = parameters(network(chain(16))), parameters(network(chain(16), "none"))
+        assert abs(without / whole - 1) < 0.03
 
 
 def test_the_random_graph_has_as_many_edges_and_is_always_the_same() -> None:
@@ -134,7 +136,7 @@ def test_dmanet_tells_a_pose_at_any_input_size() -> None:
     network.eval()
     images = torch.rand(3, 3, 64, 64)
     torch.testing.assert_close(network(images)[1:2], network(images[1:2]), atol=1e-5, rtol=1e-4)
-    assert dmanet_s()(torch.rand(2, 3, 64, 64)).shape == (2, 3 + AttitudeBins(dmanet_s().config.bins).count)
+    assert dmanet_xs()(torch.rand(2, 3, 64, 64)).shape == (2, 3 + AttitudeBins(dmanet_xs().config.bins).count)
 
 
 def test_gradients_reach_every_parameter_of_dmanet() -> None:
@@ -175,14 +177,15 @@ def multiply_accumulates(network: torch.nn.Module) -> float:
     return counter.get_total_flops() / 2
 
 
-def test_the_small_networks_cost_the_same_to_run() -> None:
-    ours = multiply_accumulates(gknet_s(chain(16)))
-    for other in (hrnet_s(16), resunet_s(16), dmanet_s()):
+def test_the_methods_cost_the_same_to_run() -> None:
+    ours = multiply_accumulates(gknet_xs(chain(16)))
+    for other in (hrnet_xs(16), resunet_xs(16), dmanet_xs()):
         assert abs(multiply_accumulates(other) / ours - 1) < 0.05
 
 
 def test_named_sizes() -> None:
     assert 2e6 < parameters(gknet_s(chain(16))) < 3.5e6
+    assert 0.8e6 < parameters(gknet_xs(chain(16))) < 1e6
     assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
     assert 28e6 < parameters(hrnet(16)) < 30e6
     assert 23e6 < parameters(resunet(16)) < 26e6

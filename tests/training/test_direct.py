@@ -40,7 +40,7 @@ from tests.training.toy import POINTS, drawn, toy_spacecraft  # noqa: E402
 CRAFT = toy_spacecraft()
 CACHE_SIZE, INPUT_SIZE = 160, 64
 SETTINGS = TrainSettings(
-    network="dmanet-s",
+    network="dmanet-xs",
     epochs=1,
     stages=(Stage(1.0, 64, 4),),
     precision="32-true",
@@ -186,7 +186,7 @@ def test_a_frame_whose_origin_is_behind_the_camera_counts_for_nothing(data: Path
     cache = build_cache(dataset, dataset.spacecraft, data / "cache", 96)
     blind = replace(cache, poses=np.full_like(cache.poses, np.nan))
     batch = Loader(blind, draw_keypoints, 0).batch(0, Stage(1, 64, 4))
-    network = build("dmanet-s", CRAFT.adjacency)
+    network = build("dmanet-xs", CRAFT.adjacency)
     loss = make_task(network, CRAFT, SETTINGS).loss(network, batch, torch.device("cpu"))
     assert loss.item() == 0
 
@@ -203,7 +203,7 @@ def test_pixels_that_are_not_square_are_refused_to_a_direct_network_alone() -> N
             return replace(frame, camera=Camera(wide, 512, 512))
 
     with pytest.raises(GknetError, match=r"frame 0: expected square pixels, got fx / fy of 1\.100"):
-        check_cameras(build("dmanet-s", CRAFT.adjacency), Frames())
+        check_cameras(build("dmanet-xs", CRAFT.adjacency), Frames())
     check_cameras(build("gknet-s", CRAFT.adjacency), Frames())
 
 
@@ -269,13 +269,13 @@ def test_the_commands_work_with_it(data: Path, model: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("option", "said"),
-    [(("--graph", "identity"), "graph: dmanet-s has none"), (("--loss", "squared"), "loss: dmanet-s has its own")],
+    [(("--graph", "identity"), "graph: dmanet-xs has none"), (("--loss", "squared"), "loss: dmanet-xs has its own")],
 )
 def test_what_it_does_not_have_is_refused_in_one_line(
     option: tuple[str, str], said: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["train", str(data), "--spacecraft", "satellite_01", "--out", str(tmp_path / "run"), "--epochs", "1"]
-    assert command([*words, "--network", "dmanet-s", *option]) == 2
+    assert command([*words, "--network", "dmanet-xs", *option]) == 2
     line = capsys.readouterr().err
     assert line.startswith(f"gknet: {said}")
     assert line.count("\n") == 1

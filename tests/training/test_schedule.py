@@ -68,7 +68,7 @@ def test_warm_restarts() -> None:
 
 
 def test_choices_that_a_network_does_not_have_are_refused() -> None:
-    for network in ("hrnet-s", "resunet", "locator"):
+    for network in ("hrnet-xs", "resunet", "locator"):
         with pytest.raises(GknetError, match="graph"):
             TrainSettings(network, "identity", epochs=1)
     with pytest.raises(GknetError, match="loss"):

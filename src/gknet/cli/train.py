@@ -13,7 +13,10 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
     spacecraft: Annotated[str, typer.Option(help="Which spacecraft of the dataset.")],
     network: Annotated[
-        str, typer.Option(help="gknet-s, hrnet-s, resunet-s, dmanet-s, gknet-paper, hrnet, resunet, dmanet or locator.")
+        str,
+        typer.Option(
+            help="gknet-s, gknet-xs, hrnet-xs, resunet-xs, dmanet-xs, gknet-paper, hrnet, resunet, dmanet or locator."
+        ),
     ] = "gknet-s",
     graph: Annotated[
         str, typer.Option(help="skeleton, identity (no edges), random (as many) or none (no graph branch).")

@@ -6,10 +6,11 @@ import queue
 import threading
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -116,11 +117,8 @@ class Loader:
     def sample(self, position: int, size: int) -> Sample:
         """The sample at `position` in the endless order of shuffled epochs."""
         epoch, place = divmod(position, len(self.cache))
-        row = int(self._order(epoch)[place])
+        row = int(_order(self.seed, epoch, len(self.cache))[place])
         return self.draw(np.random.default_rng((self.seed, epoch, row)), self.cache, row, size)
-
-    def _order(self, epoch: int) -> ndarray:
-        return np.random.default_rng((self.seed, epoch)).permutation(len(self.cache))
 
     def batch(self, position: int, stage: Stage) -> Batch:
         """The batch that begins at `position`; processes take turns, sample by sample."""
@@ -160,6 +158,11 @@ class Loader:
         finally:
             stop.set()
             thread.join()
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, count: int) -> Int[ndarray, "count"]:
+    return np.random.default_rng((seed, epoch)).permutation(count)
 
 
 def _put(ready: queue.Queue, item: Batch | BaseException, stop: threading.Event) -> None:
