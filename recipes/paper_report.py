@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from gknet.atomic import write_text
-from gknet.comparison import Interval, Trial, difference, mean_of
+from gknet.comparison import LOW_VISIBILITY, Interval, Trial, difference, mean_of
 from gknet.errors import GknetError
 from gknet.fleet import NAMES
 
@@ -199,8 +199,13 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str) -> str:
     parts.append(
         "## The graph on hidden keypoints, RMSE in px\n" + rmse_table(trials, GRAPHS, "oracle", "rmse_hidden_px")
     )
+    parts.append(
+        f"## The graph where less than {100 * LOW_VISIBILITY:.0f} % of the keypoints are seen, RMSE in px\n"
+        + rmse_table(trials, GRAPHS, "oracle", "rmse_low_px")
+    )
     parts.append("## The skeleton less the other graphs, paired by frame\n")
-    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], ("rmse_px", "rmse_hidden_px"), "oracle")
+    metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped")
+    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
     parts.append("## Swaps, ours, oracle crop\n" + swap_table(trials))
     return "\n\n".join(parts) + "\n"
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gknet.comparison import Trial, difference, mean_of
+from gknet.comparison import LOW_VISIBILITY, Trial, difference, mean_of
+from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
+from gknet.evaluation import evaluate
+from tests.cli.toy import ToyEstimator, write_toy_dataset
 
 
 def trial(method: str, values: np.ndarray, seed: int = 0, per_sequence: int = 10) -> Trial:
@@ -73,3 +78,20 @@ def test_a_trial_survives_json() -> None:
     assert (again.confusion == first.confusion).all()
     with pytest.raises(GknetError, match="trial"):
         Trial.from_dict({"method": "a"})
+
+
+def test_a_trial_says_what_its_run_measured(tmp_path: Path) -> None:
+    dataset = SkdDataset(write_toy_dataset(tmp_path / "set", sequences=1, frames=3))
+    (run,) = evaluate(dataset, ToyEstimator(), ("oracle",)).runs
+    clear, veiled, unknown = run.cases
+    count = len(clear.taken_for)
+    exchanged = np.arange(count)
+    exchanged[[0, 1]] = 1, 0
+    clear = replace(clear, errors=replace(clear.errors, visible_fraction=LOW_VISIBILITY), taken_for=exchanged)
+    own = np.where(np.isnan(veiled.keypoint_px), -1, np.arange(count))
+    veiled = replace(veiled, errors=replace(veiled.errors, visible_fraction=LOW_VISIBILITY - 0.01), taken_for=own)
+    unknown = replace(unknown, errors=replace(unknown.errors, visible_fraction=None), taken_for=np.full(count, -1))
+    values = Trial.of(replace(run, cases=(clear, veiled, unknown)), "a", "toy", 0).values
+    np.testing.assert_array_equal(np.isnan(values["rmse_low_px"]), [True, False, True])
+    assert values["rmse_low_px"][1] == values["rmse_px"][1] == veiled.errors.rmse_px
+    np.testing.assert_allclose(values["swapped"], [2 / (~np.isnan(clear.keypoint_px)).sum(), 0, 0])

@@ -14,9 +14,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.evaluation import Run, confusion
+from gknet.evaluation import Case, Run, confusion
 
-METRICS = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
+LOW_VISIBILITY = 0.6
+"""Share of the keypoints that are seen, below which a frame counts as one of low visibility."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Trial:
     """One network's errors on the test frames.
 
     sequences  (m,) the sequence of each frame
-    values     metric -> (m,), NaN where the frame cannot say
+    values     metric of `measured` -> (m,), NaN where the frame cannot say
     confusion  (n, n) how often keypoint i was detected at keypoint j
     """
 
@@ -39,9 +40,10 @@ class Trial:
     @staticmethod
     def of(run: Run, method: str, spacecraft: str, seed: int) -> Trial:
         found = [case.errors for case in run.cases]
+        rows = [measured(case) for case in run.cases]
         values = {
-            metric: np.array([np.nan if (v := getattr(e, metric)) is None else v for e in found], dtype=np.float64)
-            for metric in METRICS
+            metric: np.array([np.nan if (v := row[metric]) is None else v for row in rows], dtype=np.float64)
+            for metric in rows[0]
         }
         sequences = tuple(e.sequence for e in found)
         frames = tuple(e.name for e in found)
@@ -80,6 +82,27 @@ class Trial:
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise GknetError(f"trial: expected the content that a trial writes ({error!r})") from error
+
+
+def measured(case: Case) -> dict[str, float | None]:
+    """What methods are compared by, None where the frame cannot say.
+
+    rmse_px, rmse_hidden_px, e_t, e_q_rad   as in `gknet.metrics.FrameErrors`
+    rmse_low_px   rmse_px of a frame of low visibility
+    swapped       share of the keypoints in view that were detected at another one's place (`taken_for`)
+    """
+    errors = case.errors
+    low = errors.visible_fraction is not None and errors.visible_fraction < LOW_VISIBILITY
+    elsewhere = (case.taken_for >= 0) & (case.taken_for != np.arange(len(case.taken_for)))
+    in_view = int((~np.isnan(case.keypoint_px)).sum())
+    return {
+        "rmse_px": errors.rmse_px,
+        "rmse_hidden_px": errors.rmse_hidden_px,
+        "e_t": errors.e_t,
+        "e_q_rad": errors.e_q_rad,
+        "rmse_low_px": errors.rmse_px if low else None,
+        "swapped": elsewhere.sum() / in_view if in_view else None,
+    }
 
 
 @dataclass(frozen=True)
