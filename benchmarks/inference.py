@@ -12,7 +12,6 @@ picture does. The pose solver is timed on the projected keypoints with noise, si
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from rich.table import Table
 from gknet.crop import Crop
 from gknet.decode import decode_heatmaps
 from gknet.direct import DirectEstimator, decode_output
-from gknet.errors import GknetError
+from gknet.errors import ends_in_one_line
 from gknet.estimator import Estimator, load_estimator
 from gknet.frame import Keypoints
 from gknet.geometry import Camera, Pose
@@ -136,7 +135,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        sys.exit(f"error: {error}")

@@ -14,6 +14,7 @@ import argparse
 import shutil
 from pathlib import Path
 
+from gknet.errors import ends_in_one_line
 from gknet.render.generate import generate
 
 TEST_SEQUENCES = {"satellite_01": 7, "satellite_02": 17, "satellite_03": 14}
@@ -38,4 +39,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_one_line():
+        main()

@@ -13,7 +13,6 @@ Expected   keypoints.jpg and overlays.jpg from the bundled frames; detections.jp
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from numpy import ndarray
 from gknet.atomic import write_bytes
 from gknet.cli.demo import bundled_frames
 from gknet.dataset.skd import SkdDataset
-from gknet.errors import GknetError
+from gknet.errors import GknetError, ends_in_one_line
 from gknet.estimator import load_estimator
 from gknet.fleet import NAMES
 from gknet.frame import Estimate, Frame
@@ -146,8 +145,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

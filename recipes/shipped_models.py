@@ -21,7 +21,6 @@ import argparse
 import multiprocessing
 import os
 import shutil
-import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from torch import Tensor
 
 from gknet.cli.evaluate import evaluate
 from gknet.dataset.skd import SkdDataset
-from gknet.errors import GknetError
+from gknet.errors import ends_in_one_line
 from gknet.fleet import NAMES
 from gknet.network.build import build
 from gknet.render.generate import generate
@@ -263,8 +262,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class GknetError(Exception):
     """Bad input or a missing piece. The message is one line: what, what was expected, what came, the remedy.
@@ -15,3 +19,13 @@ class MissingExtraError(GknetError):
 
     def __init__(self, extra: str, module: str) -> None:
         super().__init__(f"this needs the module '{module}': pip install 'gknet[{extra}]'")
+
+
+@contextmanager
+def ends_in_one_line() -> Iterator[None]:
+    """For scripts: a GknetError becomes one line on standard error and exit code 2."""
+    try:
+        yield
+    except GknetError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from error
