@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import numpy as np
 
 from gknet.atomic import write_text
 from gknet.comparison import LOW_VISIBILITY, Interval, Trial, difference, mean_of
-from gknet.errors import GknetError
+from gknet.errors import GknetError, ends_in_one_line
 from gknet.fleet import NAMES
 
 PAPER_RMSE = {
@@ -53,11 +52,14 @@ def read(folder: Path) -> tuple[Trials, dict[str, list[dict]]]:
     trials: Trials = defaultdict(list)
     costs: dict[str, list[dict]] = defaultdict(list)
     for path in sorted(folder.glob("satellite_*.json")):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        for protocol, values in content.pop("protocols").items():
-            trial = Trial.from_dict(values)
-            trials[content["name"], trial.spacecraft, protocol].append(trial)
-        costs[content["name"]].append(content)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            for protocol, values in content.pop("protocols").items():
+                trial = Trial.from_dict(values)
+                trials[content["name"], trial.spacecraft, protocol].append(trial)
+            costs[content["name"]].append(content)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, GknetError) as error:
+            raise GknetError(f"{path}: not a result of recipes/paper_tables.py ({error}); delete it") from error
     if not trials:
         raise GknetError(f"{folder}: no results; run recipes/paper_tables.py first")
     return trials, costs
@@ -206,7 +208,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str) -> str:
     parts.append("## The skeleton less the other graphs, paired by frame\n")
     metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
-    parts.append("## Swaps, ours, oracle crop\n" + swap_table(trials))
+    parts.append("## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + swap_table(trials))
     return "\n\n".join(parts) + "\n"
 
 
@@ -222,8 +224,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

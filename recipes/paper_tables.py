@@ -28,7 +28,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -42,7 +41,7 @@ from gknet.atomic import write_text
 from gknet.comparison import Trial
 from gknet.dataset.skd import SkdDataset
 from gknet.direct import DirectEstimator
-from gknet.errors import GknetError
+from gknet.errors import GknetError, ends_in_one_line
 from gknet.estimator import load_estimator
 from gknet.evaluation import Run, evaluate
 from gknet.fleet import NAMES
@@ -142,9 +141,12 @@ SCALES = {
 
 
 def parse_share(text: str) -> tuple[int, int]:
-    share, shares = (int(part) for part in text.split("/"))  # argparse turns a ValueError into one line
+    try:
+        share, shares = (int(part) for part in text.split("/"))
+    except ValueError:
+        share, shares = 0, 0
     if not 0 <= share < shares:
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError(f"expected I/N with I from 0 to N - 1, got '{text}'")
     return share, shares
 
 
@@ -236,7 +238,10 @@ def best_rate(results: Path, scale: Scale, network: str) -> float:
     for rate in scale.rates:
         path = sweep_path(results, network, rate)
         wait_for(path)
-        scores[rate] = json.loads(path.read_text(encoding="utf-8"))["score"]
+        try:
+            scores[rate] = float(json.loads(path.read_text(encoding="utf-8"))["score"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise GknetError(f"{path}: not a score of the sweep ({error}); delete it and run again") from error
     return min(scores, key=lambda rate: scores[rate])
 
 
@@ -315,8 +320,5 @@ def cost(method: Method, network: OnnxNetwork, size: int) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

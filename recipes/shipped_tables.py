@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import onnxruntime
 
 from gknet.atomic import write_text
-from gknet.errors import GknetError
+from gknet.errors import GknetError, ends_in_one_line
 from gknet.fleet import NAMES
 from gknet.onnx_network import METADATA_KEY
 
@@ -88,6 +87,16 @@ def background_table(results: Path, recipe: str) -> str:
     return "\n".join(lines)
 
 
+def validated(path: Path) -> dict[str, Any]:
+    """What the export wrote about a model, its validation included."""
+    try:
+        session = onnxruntime.InferenceSession(str(path))
+        about = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+    except Exception as error:  # onnxruntime's exceptions have no common base
+        raise GknetError(f"{path}: not a model that 'gknet export' wrote ({error})") from error
+    return about
+
+
 def card(models: Path, results: Path, name: str) -> str:
     """What is known of one spacecraft's two networks."""
     lines = [f"# gknet models of {name}", ""]
@@ -99,8 +108,7 @@ def card(models: Path, results: Path, name: str) -> str:
     lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
     for kind in ("keypoints", "locator"):
         path = models / name / f"{kind}.onnx"
-        session = onnxruntime.InferenceSession(str(path))
-        about = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+        about = validated(path)
         best = ", ".join(f"{key} {value:.3g}" for key, value in about["validation"].items())
         size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
         lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
@@ -138,8 +146,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line():
         main()
-    except GknetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

@@ -67,6 +67,8 @@ def test_different_frames_are_not_compared() -> None:
         mean_of([], "rmse_px")
     with pytest.raises(GknetError, match="no frame"):
         mean_of([trial("a", np.full(20, np.nan))], "rmse_px")
+    with pytest.raises(GknetError, match="no metric swapped"):
+        mean_of([trial("a", values)], "swapped")
 
 
 def test_a_trial_survives_json() -> None:

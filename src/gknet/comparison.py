@@ -150,6 +150,8 @@ def _by_sequence(
         raise GknetError("comparison: expected at least one trial, got none")
     if any(trial.frames != trials[0].frames for trial in trials):
         raise GknetError(f"comparison: the trials of {trials[0].method} were judged on different frames")
+    if any(metric not in trial.values for trial in trials):
+        raise GknetError(f"comparison: the trials of {trials[0].method} know no metric {metric}; judge them again")
     names = sorted(set(trials[0].sequences))
     place = np.array([names.index(sequence) for sequence in trials[0].sequences])
     sums, counts = np.zeros((len(trials), len(names))), np.zeros((len(trials), len(names)))

@@ -15,6 +15,7 @@ from gknet.direct import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.network.backbone import position_code  # noqa: E402
 from gknet.network.build import (  # noqa: E402
+    GRAPH_NETWORKS,
     build,
     configured,
     dmanet,
@@ -83,6 +84,19 @@ def test_without_edges_the_size_is_the_same() -> None:
     for network in (gknet_s, gknet_xs):
         whole, without = parameters(network(chain(16))), parameters(network(chain(16), "none"))
         assert abs(without / whole - 1) < 0.03
+
+
+@pytest.mark.parametrize("name", GRAPH_NETWORKS)
+def test_a_named_network_has_the_graph_that_was_asked_for(name: str) -> None:
+    skeleton = chain(5)
+    for graph in ("skeleton", "identity", "random"):
+        network = build(name, skeleton, graph)
+        found = [each for key, each in network.named_buffers() if key.endswith("adjacency")]
+        assert found
+        for each in found:
+            torch.testing.assert_close(each, normalised_adjacency(skeleton, graph))  # type: ignore[arg-type]
+    without = build(name, skeleton, "none")
+    assert not [key for key, _ in without.named_buffers() if key.endswith("adjacency")]
 
 
 def test_the_random_graph_has_as_many_edges_and_is_always_the_same() -> None:

@@ -164,6 +164,10 @@ def test_an_epoch_shows_every_row_once(folder: Path) -> None:
     epochs = [shown[start : start + 12] for start in range(0, 60, 12)]
     assert all(sorted(rows) == list(range(12)) for rows in epochs)
     assert epochs[0] != epochs[1]
+    shown.clear()
+    for position in range(0, 10, 5):
+        replace(items, seed=items.seed + 1).batch(position, Stage(1, 64, 5))
+    assert shown != epochs[0][:10]  # another seed, another order
 
 
 def test_a_batch_is_its_samples_in_order(folder: Path) -> None:

@@ -1,0 +1,58 @@
+"""What the recipes say to bad input: one line that names it, and exit code 2."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("mitsuba")
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+def refused(name: str, *words: object) -> str:
+    command = [sys.executable, str(RECIPES / name), *map(str, words)]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 2, run.stderr
+    assert "Traceback" not in run.stderr
+    return run.stderr
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"name": "GKNet", "protocols": {"oracle": {}}}'])
+def test_a_result_that_is_none(content: str, tmp_path: Path) -> None:
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "cpu" / "satellite_01_a_0.json").write_text(content)
+    said = refused("paper_report.py", "--results", tmp_path)
+    assert said.startswith("error: ")
+    assert "satellite_01_a_0.json: not a result" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "cpu" / "README.md").exists()
+
+
+def test_a_score_that_is_none(tmp_path: Path) -> None:
+    work, sweep = tmp_path / "work" / "cpu", tmp_path / "results" / "cpu" / "sweep"
+    work.mkdir(parents=True)
+    sweep.mkdir(parents=True)
+    (work / "rendered_satellite_02").touch()
+    for network in ("gknet-xs", "hrnet-xs", "resunet-xs", "dmanet-xs"):
+        for rate in ("0.001", "0.002", "0.004"):
+            (sweep / f"{network}_{rate}.json").write_text("{}")
+    folders = ("--work", tmp_path / "work", "--results", tmp_path / "results")
+    said = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
+    assert "gknet-xs_0.001.json: not a score" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("share", ["2/2", "-1/2", "1", "a/b", "0/0"])
+def test_a_share_that_is_none(share: str, tmp_path: Path) -> None:
+    said = refused("paper_tables.py", "--work", tmp_path, "--results", tmp_path, f"--share={share}")
+    assert f"expected I/N with I from 0 to N - 1, got '{share}'" in said
+
+
+def test_models_that_are_none(tmp_path: Path) -> None:
+    assert "keypoints.onnx" in refused("shipped_tables.py", "--models", tmp_path, "--results", tmp_path)
+    assert "no model" in refused("paper_figures.py", "--out", tmp_path, "--work", tmp_path)
