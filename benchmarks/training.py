@@ -29,9 +29,10 @@ from gknet.network.build import build
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Loader
 from gknet.training.cache import Cache
+from gknet.training.optimizer import make_optimizer
 from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
-from gknet.training.setup import cpu_has_bf16, make_optimizer, make_task, open_cache, update_average
+from gknet.training.setup import cpu_has_bf16, make_task, open_cache, update_average
 
 ROUNDS = 4
 

@@ -116,11 +116,11 @@ def methods(suffix: str) -> tuple[tuple[Method, ...], tuple[Method, ...]]:
     return table, ablation
 
 
-CPU_STAGES = (Stage(0.75, 128, 16), Stage(0.25, 192, 16))
 PAPER = TrainSettings(
     epochs=80,
     stages=(Stage(1.0, 256, 16),),
     learning_rate=0.01,
+    optimizer="adamw",
     weight_decay=0.0,  # AdamW without decay is Adam
     warm_up=0.0,
     cycles=5,
@@ -133,8 +133,8 @@ SCALES = {
         TrainSettings(epochs=0.5, stages=(Stage(1.0, 64, 8),), validations=1, val_frames=8),
     ),
     "cpu": Scale(
-        *methods("-xs"), 2, 30, 15, None, None, (0,), (1, 2), (1e-3, 2e-3, 4e-3), 1.5,
-        TrainSettings(epochs=9, stages=CPU_STAGES, validations=4, val_frames=200),
+        *methods("-xs"), 2, 30, 15, None, None, (0,), (1, 2), (3e-3, 6e-3), 3,
+        TrainSettings(epochs=6, stages=(Stage(1.0, 128, 16),), validations=4, val_frames=200),
     ),
     "full": Scale(*methods(""), 1, 10, 1, None, None, (0, 1, 2), (), (0.01,), 80, PAPER),
 }  # fmt: skip

@@ -44,7 +44,7 @@ from gknet.training.setup import make_task
 from gknet.training.validation import validation_rows
 
 DATA_SEED, TRAINING_SEED = 0, 1
-LEARNING_RATE = 1e-3
+FIRST_RATE, FURTHER_RATE = 2e-3, 1e-3
 """Of weights that are trained on: half the default, which would undo much of what they know."""
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Of the later weights in the mean with those that a run began with."""
@@ -151,7 +151,8 @@ def run_settings(
         network,
         minutes=minutes,
         stages=stages,
-        learning_rate=TrainSettings.learning_rate if init is None else LEARNING_RATE,
+        optimizer="adamw",  # what ships was trained by it, before decision 0011
+        learning_rate=FIRST_RATE if init is None else FURTHER_RATE,
         validations=validations,
         val_frames=200,
         seed=TRAINING_SEED,

@@ -29,10 +29,11 @@ from gknet.training.checkpoint import (
     save_weights,
     warm_start,
 )
+from gknet.training.optimizer import make_optimizer
 from gknet.training.progress import Teller
 from gknet.training.schedule import Budget, learning_rate, stage_at
 from gknet.training.settings import Run, TrainSettings
-from gknet.training.setup import check_cameras, make_fabric, make_optimizer, make_task, open_cache, update_average
+from gknet.training.setup import check_cameras, make_fabric, make_task, open_cache, update_average
 from gknet.training.validation import usable_rows, validation_rows
 
 REPORT_STEPS = 50

@@ -17,6 +17,7 @@ from gknet.network.heatmap import checked_loss
 from gknet.training.cache import Window
 from gknet.training.schedule import Stage
 
+OPTIMIZERS = ("muon", "adamw")
 PAPER_STAGES = (Stage(1.0, 256, 16),)
 STAGES = {
     "gknet-s": (Stage(0.4, 128, 32), Stage(0.3, 192, 32), Stage(0.3, 256, 32)),
@@ -36,6 +37,7 @@ class TrainSettings:
     loss              "likelihood" or "squared"; None takes the network's own
     minutes, epochs   the budget: exactly one of them
     stages            None takes the network's own (STAGES)
+    optimizer         "muon" (and AdamW for what it is not for) or "adamw"
     warm_up           share of the budget in which the learning rate rises
     cycles            of the cosine; more than one are warm restarts
     ema               how much of the averaged weights stays at each step
@@ -53,7 +55,8 @@ class TrainSettings:
     minutes: float | None = None
     epochs: float | None = None
     stages: tuple[Stage, ...] | None = None
-    learning_rate: float = 2e-3
+    optimizer: str = "muon"
+    learning_rate: float = 4e-3
     weight_decay: float = 1e-2
     warm_up: float = 0.03
     cycles: int = 1
@@ -77,6 +80,8 @@ class TrainSettings:
             raise GknetError(f"graph: {self.network} has none to choose; only {', '.join(GRAPH_NETWORKS)} have")
         if self.loss is not None and checked_loss(self.loss) and self.network in OWN_LOSS_NETWORKS:
             raise GknetError(f"loss: {self.network} has its own; leave it out")
+        if self.optimizer not in OPTIMIZERS:
+            raise GknetError(f"optimizer: expected one of {', '.join(OPTIMIZERS)}, got '{self.optimizer}'")
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
         for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):

@@ -1,4 +1,4 @@
-"""What a training needs before its loop: device and precision, network and task, optimizer, cached crops."""
+"""What a training needs before its loop: device and precision, network and task, cached crops."""
 
 from __future__ import annotations
 
@@ -85,14 +85,6 @@ def check_cameras(network: Network, frames: FrameSource) -> None:
             raise GknetError(
                 f"{frame.name}: expected square pixels, got fx / fy of {ratio:.3f}; resize the pictures to train on"
             )
-
-
-def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
-    """AdamW; only matrices and kernels decay."""
-    matrices = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1]
-    groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
 
 
 @torch.no_grad()
