@@ -45,7 +45,7 @@ from gknet.training.validation import validation_rows
 
 DATA_SEED, TRAINING_SEED = 0, 1
 FIRST_RATE, FURTHER_RATE = 2e-3, 1e-3
-"""Of weights that are trained on: half the default, which would undo much of what they know."""
+"""From scratch, and of weights that are trained on: the first rate would undo much of what they know."""
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Of the later weights in the mean with those that a run began with."""
 FIRST = "first"

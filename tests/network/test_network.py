@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from gknet.network.build import (  # noqa: E402
 )
 from gknet.network.dmanet import DMANet, DMANetConfig, MultiScaleAttention  # noqa: E402
 from gknet.network.gknet import GKNet, GKNetConfig  # noqa: E402
-from gknet.network.graph import Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
+from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_belief  # noqa: E402
 from gknet.network.hrnet import HRNet, HRNetConfig  # noqa: E402
 from gknet.network.resunet import ResUNet, ResUNetConfig  # noqa: E402
@@ -231,9 +232,10 @@ def test_the_graph_is_a_constant_of_the_spacecraft() -> None:
     assert torch.equal(before, network.decoder.layers[0].graph.adjacency)
 
 
-def test_nodes_mix_along_edges_only() -> None:
+@pytest.mark.parametrize("kind", [GraphConvolution, EdgeConvolution])
+def test_nodes_mix_along_edges_only(kind: type[torch.nn.Module]) -> None:
     torch.manual_seed(1)
-    layer = GraphConvolution(normalised_adjacency(chain(5)), 8, 8)
+    layer = kind(normalised_adjacency(chain(5)), 8, 8)
     nodes = torch.randn(1, 5, 8)
     moved = nodes.clone()
     moved[0, 0] += 1
@@ -241,12 +243,13 @@ def test_nodes_mix_along_edges_only() -> None:
     assert changed.tolist() == [True, True, False, False, False]
 
 
-def test_renumbering_the_keypoints_renumbers_nodes_and_nothing_else() -> None:
+@pytest.mark.parametrize("kind", [GraphConvolution, EdgeConvolution])
+def test_renumbering_the_keypoints_renumbers_nodes_and_nothing_else(kind: type[torch.nn.Module]) -> None:
     order = torch.tensor([3, 0, 4, 1, 2])
     torch.manual_seed(2)
-    layer = GraphConvolution(normalised_adjacency(chain(5)), 8, 8)
+    layer = kind(normalised_adjacency(chain(5)), 8, 8)
     matrix = chain(5)[np.ix_(order.numpy(), order.numpy())]
-    other = GraphConvolution(normalised_adjacency(matrix), 8, 8)
+    other = kind(normalised_adjacency(matrix), 8, 8)
     other.load_state_dict(layer.state_dict())
     nodes = torch.randn(2, 5, 8)
     torch.testing.assert_close(layer(nodes)[:, order], other(nodes[:, order]))
@@ -267,6 +270,48 @@ def test_renumbering_the_keypoints_of_a_network_renumbers_its_channels() -> None
     torch.testing.assert_close(other(image), network(image)[:, order], atol=1e-4, rtol=1e-4)
 
 
+def test_a_message_knows_both_of_its_ends() -> None:
+    """What node 1 tells node 2 depends on node 2: under eq. 2 it would tell all its neighbours the same."""
+    torch.manual_seed(4)
+    layer = EdgeConvolution(normalised_adjacency(chain(3)), 8, 8)
+    nodes = torch.randn(1, 3, 8)
+    silent = nodes.clone()
+    silent[0, 0] = torch.randn(8)
+    told = (layer(nodes) - layer(silent))[0]  # by a change of node 0
+    nodes[0, 1] += 1
+    silent[0, 1] += 1
+    told_anew = (layer(nodes) - layer(silent))[0]
+    assert (told[1] - told_anew[1]).abs().max() > 1e-3
+    assert not told[2].any()
+
+
+def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> None:
+    """Certain maps of the other branch: each node sees the code of the one place, nothing else."""
+    network = tiny(5).eval()
+    assert network.decoder is not None
+    with torch.no_grad():
+        network.node_filter.weight.zero_()
+        network.pixel_head.weight.zero_()
+    glances: list[torch.Tensor] = []
+    for layer in network.decoder.layers:
+        layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0]))
+    up, memory = torch.randn(1, 8, 16, 16), torch.randn(1, 6, 8)
+    pixels = torch.zeros(1, 5, 16, 16)
+    for k in range(5):
+        pixels[0, k, 2 * k, 4] = 10
+    network._graph_maps(memory, up, pixels)
+    assert len(glances) == 2
+    for seen in glances:
+        torch.testing.assert_close(seen[0, :, 8:], position_code(16, 16, up)[:, :10:2, 4].T, atol=1e-5, rtol=1e-4)
+
+
+def test_without_glances_the_decoder_is_the_one_of_equation_2() -> None:
+    network = GKNet(replace(tiny(4).config, glances=False), chain(4))
+    assert network.decoder is not None
+    assert all(isinstance(layer.graph, GraphConvolution) for layer in network.decoder.layers)
+    assert not [name for name in network.state_dict() if "seen" in name]
+
+
 def test_every_picture_of_a_batch_is_mixed_by_the_same_matrix() -> None:
     torch.manual_seed(3)
     adjacency = normalised_adjacency(chain(5))
@@ -282,8 +327,9 @@ def test_at_the_start_both_branches_reach_the_output_channel_by_channel() -> Non
     torch.testing.assert_close(fusion(pixels, nodes), pixels + nodes)
 
 
-def test_at_the_start_the_graph_does_not_drown_the_other_branch() -> None:
-    branches = gknet_s(chain(16)).branches(torch.rand(2, 3, 128, 128))
+@pytest.mark.parametrize("make", [gknet_s, gknet_xs])
+def test_at_the_start_the_graph_does_not_drown_the_other_branch(make: Callable[[np.ndarray], GKNet]) -> None:
+    branches = make(chain(16)).branches(torch.rand(2, 3, 128, 128))
     assert branches.nodes is not None
     assert branches.fused.abs().max() < 1
     assert branches.nodes.abs().mean() < 0.1

@@ -21,7 +21,7 @@ from gknet.network.backbone import (
     position_code,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
-from gknet.network.heatmap import Branches, HeatmapNetwork
+from gknet.network.heatmap import Branches, HeatmapNetwork, log_belief
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class GKNetConfig:
     node_width     channels of a graph node and of the image cells that it attends to
     node_layers    layers of the graph decoder
     heads          attention heads
+    glances        whether nodes see, between layers, what is where they believe their keypoints to be (decision 0012)
     graph          "skeleton", "identity" (no edges), "random" (as many edges, anywhere) or "none" (no graph branch)
     """
 
@@ -41,6 +42,7 @@ class GKNetConfig:
     node_width: int = 128
     node_layers: int = 3
     heads: int = 4
+    glances: bool = True
     graph: str = "skeleton"
 
     def __post_init__(self) -> None:
@@ -76,7 +78,10 @@ class GKNet(HeatmapNetwork):
         config = self.config
         edges = normalised_adjacency(adjacency, checked_graph(config.graph))
         self.fine_cells = nn.Conv2d(self.encoder.widths[2], config.node_width, 1)
-        self.decoder = GraphDecoder(edges, config.node_width, config.node_width, config.heads, config.node_layers)
+        glance = config.pyramid_width + POSITION_WIDTH if config.glances else 0
+        self.decoder = GraphDecoder(
+            edges, config.node_width, config.node_width, config.heads, config.node_layers, glance
+        )
         self.pixel_position = nn.Linear(POSITION_WIDTH, config.pyramid_width)
         self.pixel_features = ConvNorm(config.pyramid_width, config.pyramid_width, 1, relu=False)
         self.node_filter = nn.Linear(config.node_width, config.pyramid_width + 1)
@@ -95,7 +100,7 @@ class GKNet(HeatmapNetwork):
         if self.decoder is None:
             return Branches(pixels, pixels, None)
         memory = torch.cat([cells, self._cells(self.fine_cells(features[2]))], dim=1)
-        nodes = self._node_maps(self.decoder(memory), up)
+        nodes = self._graph_maps(memory, up, pixels)
         return Branches(self.fusion(pixels, nodes), pixels, nodes)
 
     def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
@@ -103,13 +108,25 @@ class GKNet(HeatmapNetwork):
         code = position_code(features.shape[2], features.shape[3], features).flatten(1).T
         return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
 
-    def _node_maps(self, nodes: Float[Tensor, "b n c"], up: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
+    def _graph_maps(
+        self, memory: Float[Tensor, "b m c"], up: Float[Tensor, "b p h w"], pixels: Float[Tensor, "b n h w"]
+    ) -> Float[Tensor, "b n h w"]:
         """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is."""
-        batch, _, height, width = up.shape
-        code = position_code(height, width, up).flatten(1).T
-        cells = self.pixel_features(up).permute(0, 2, 3, 1).flatten(1, 2)  # (b, hw, p)
-        cells = functional.relu(cells + self.pixel_position(code))
+        assert self.decoder is not None
+        code = position_code(up.shape[2], up.shape[3], up)
+        along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
+        places = functional.relu(self.pixel_features(up) + along)
+        if not self.config.glances:
+            return self._node_maps(self.decoder(memory), places)
+        seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
+
+        def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
+            return log_belief(self.fusion(pixels, self._node_maps(nodes, places))).exp() @ seen
+
+        return self._node_maps(self.decoder(memory, glance), places)
+
+    def _node_maps(self, nodes: Float[Tensor, "b n c"], places: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
         # (b, n, p + 1), the last one a bias; scaled so that one step of Adam moves a map by little
         filters = self.node_filter(nodes) / self.node_filter.out_features
-        maps = cells @ filters[:, :, :-1].transpose(1, 2) + filters[:, None, :, -1]  # (b, hw, n)
-        return maps.reshape(batch, height, width, -1).permute(0, 3, 1, 2)
+        maps = filters[:, :, :-1] @ places.flatten(2) + filters[:, :, -1:]
+        return maps.reshape(*maps.shape[:2], *places.shape[2:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
@@ -68,36 +69,74 @@ class GraphConvolution(nn.Module):
         return self.linear(functional.relu(self.adjacency.to(mixed.dtype) @ mixed))  # eq. 2, nodes as rows
 
 
+class EdgeConvolution(nn.Module):
+    """Messages along the edges that know both of their ends (EdgeConv, Wang et al. 2019), summed as A~ weighs them.
+
+    Under eq. 2 a node tells all its neighbours the same; here it can tell each where that one must be.
+    """
+
+    adjacency: Tensor
+
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int) -> None:
+        super().__init__()
+        self.receive = nn.Linear(width, hidden)
+        self.send = nn.Linear(width, hidden)
+        self.linear = nn.Linear(hidden, width)
+        self.register_buffer("adjacency", adjacency, persistent=False)
+
+    def forward(self, nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
+        messages = functional.relu(self.receive(nodes)[:, :, None] + self.send(nodes)[:, None])  # (b, to, from, c)
+        return self.linear((self.adjacency.to(messages.dtype)[:, :, None] * messages).sum(dim=2))
+
+
+Glance = Callable[[Tensor], Tensor]
+"""Nodes (b, n, c) -> what is seen where each of them believes its keypoint to be (b, n, p)."""
+
+
 class GraphLayer(nn.Module):
     """Nodes look at the picture, then talk along the edges; each with a residual and a LayerNorm.
 
     The edges are the only way from node to node, so that an ablation of the edges is one of the graph.
+    With a width of glances, nodes say in between where they believe their keypoints to be and see what is there, and
+    messages know both ends; without one (0) the layer is the paper's.
     """
 
-    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int) -> None:
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, glance: int) -> None:
         super().__init__()
         self.look = Attention(width, heads)
         self.after_look = nn.LayerNorm(width)
-        self.graph = GraphConvolution(adjacency, width, hidden)
+        if glance:
+            self.seen = nn.Linear(glance, width)
+            self.after_seen = nn.LayerNorm(width)
+        self.graph = (EdgeConvolution if glance else GraphConvolution)(adjacency, width, hidden)
         self.after_graph = nn.LayerNorm(width)
 
-    def forward(self, nodes: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+    def forward(
+        self, nodes: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"], glance: Glance | None
+    ) -> Float[Tensor, "b n c"]:
         nodes = self.after_look(nodes + self.look(nodes, memory))
+        if glance is not None:
+            nodes = self.after_seen(nodes + self.seen(glance(nodes)))
         return self.after_graph(nodes + self.graph(nodes))
 
 
 class GraphDecoder(nn.Module):
-    """One learned query per keypoint becomes that keypoint's node; any number of keypoints."""
+    """One learned query per keypoint becomes that keypoint's node; any number of keypoints.
 
-    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, layers: int) -> None:
+    glance  channels of what a node sees at a glance; 0 where it is given none
+    """
+
+    def __init__(
+        self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, layers: int, glance: int = 0
+    ) -> None:
         super().__init__()
         self.queries = nn.Parameter(torch.randn(len(adjacency), width) * 0.5)
-        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads) for _ in range(layers)])
+        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads, glance) for _ in range(layers)])
 
-    def forward(self, memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+    def forward(self, memory: Float[Tensor, "b m c"], glance: Glance | None = None) -> Float[Tensor, "b n c"]:
         nodes = self.queries.expand(memory.shape[0], -1, -1)
         for layer in self.layers:
-            nodes = layer(nodes, memory)
+            nodes = layer(nodes, memory, glance)
         return nodes
 
 

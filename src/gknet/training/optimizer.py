@@ -117,7 +117,8 @@ def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.O
         # The fused one unscales gradients by itself, which a clipped fp16 training must do before.
         fused = settings.precision != "16-mixed"
         return torch.optim.AdamW([{"params": many, "weight_decay": decay}, vectors], lr=rate, fused=fused)
-    large, small = [], []
+    large: list[nn.Parameter] = []
+    small: list[nn.Parameter] = []
     for parameter in many:
         (large if min(_matrix_shape(parameter)) >= SMALLEST else small).append(parameter)
     groups = [{"params": large, "weight_decay": decay, "matrices": True}, {"params": small, "weight_decay": decay}]
