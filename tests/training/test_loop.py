@@ -47,6 +47,13 @@ def located(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def glancing(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "xs"
+    train(data, "satellite_01", out, replace(SETTINGS, network="gknet-xs", epochs=1), quiet=True)
+    return out
+
+
 def saved(out: Path) -> dict:
     return torch.load(out / CHECKPOINT, weights_only=True)
 
@@ -113,8 +120,10 @@ def test_a_warm_start_takes_what_fits(finished: Path) -> None:
         warm_start(other, finished / "run.json")
 
 
-def test_exports_agree_with_torch_and_know_what_they_are(finished: Path, located: Path, tmp_path: Path) -> None:
-    for run, kind, channels in ((finished, "keypoints", 17), (located, "locator", 5)):
+def test_exports_agree_with_torch_and_know_what_they_are(
+    finished: Path, glancing: Path, located: Path, tmp_path: Path
+) -> None:
+    for run, kind, channels in ((finished, "keypoints", 17), (glancing, "keypoints", 17), (located, "locator", 5)):
         result = export_run(run, tmp_path)
         assert result.onnx_path == tmp_path / f"{kind}.onnx"
         assert result.runtime_difference <= 1e-3
