@@ -305,6 +305,27 @@ def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> 
         torch.testing.assert_close(seen[0, :, 8:], position_code(16, 16, up)[:, :10:2, 4].T, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("glances", [True, False])
+def test_without_edges_no_node_hears_of_another(glances: bool) -> None:
+    """Otherwise the ablation of the edges would not be one of the graph."""
+    for graph, heard in (("identity", False), ("skeleton", True)):
+        network = GKNet(replace(tiny(5, graph).config, glances=glances), chain(5)).eval()
+        torch.nn.init.normal_(network.fusion.join.weight)
+        torch.nn.init.normal_(network.node_filter.weight)
+        assert network.decoder is not None
+        image = torch.rand(1, 3, 64, 64)
+        before = network.branches(image).nodes
+        with torch.no_grad():
+            network.decoder.queries[2] += 1
+        after = network.branches(image).nodes
+        assert before is not None
+        assert after is not None
+        changed = (before - after).abs().amax(dim=(0, 2, 3)) > 1e-5
+        assert changed[2]
+        assert changed[[1, 3]].all() == heard
+        assert changed[[0, 1, 3, 4]].any() == heard
+
+
 def test_without_glances_the_decoder_is_the_one_of_equation_2() -> None:
     network = GKNet(replace(tiny(4).config, glances=False), chain(4))
     assert network.decoder is not None

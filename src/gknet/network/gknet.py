@@ -121,7 +121,8 @@ class GKNet(HeatmapNetwork):
         seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
 
         def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
-            return log_belief(self.fusion(pixels, self._node_maps(nodes, places))).exp() @ seen
+            # A plain sum: the fusion would be a way from node to node beside the edges.
+            return log_belief(pixels + self._node_maps(nodes, places)).exp() @ seen
 
         return self._node_maps(self.decoder(memory, glance), places)
 
