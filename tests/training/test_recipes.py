@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -38,12 +39,13 @@ def test_a_score_that_is_none(tmp_path: Path) -> None:
     work.mkdir(parents=True)
     sweep.mkdir(parents=True)
     (work / "rendered_satellite_02").touch()
-    for network in ("gknet-xs", "hrnet-xs", "resunet-xs", "dmanet-xs"):
-        for rate in ("0.001", "0.002", "0.004"):
-            (sweep / f"{network}_{rate}.json").write_text("{}")
+    scale = runpy.run_path(str(RECIPES / "paper_tables.py"))["SCALES"]["cpu"]
+    names = [f"{method.network}_{rate:g}.json" for method in scale.methods for rate in scale.rates]
+    for name in names:
+        (sweep / name).write_text("{}")
     folders = ("--work", tmp_path / "work", "--results", tmp_path / "results")
     said = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
-    assert "gknet-xs_0.001.json: not a score" in said
+    assert f"{names[0]}: not a score" in said
     assert said.count("\n") == 1
 
 
