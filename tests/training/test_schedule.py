@@ -53,8 +53,9 @@ def test_settings_name_what_is_wrong() -> None:
             TrainSettings(**bad)
     with pytest.raises(GknetError, match="network"):
         TrainSettings(epochs=1, network="hourglass")
-    with pytest.raises(GknetError, match="learning_rate"):
-        TrainSettings(epochs=1, learning_rate=0)
+    for rate in (0, -1, float("nan")):
+        with pytest.raises(GknetError, match="learning_rate"):
+            TrainSettings(epochs=1, learning_rate=rate)
     with pytest.raises(GknetError, match="ema"):
         TrainSettings(epochs=1, ema=1.0)
 

@@ -28,7 +28,9 @@ def train(
         str | None, typer.Option(help="share:input_size:batch,... such as 0.4:128:32,0.6:256:32.")
     ] = None,
     batch: Annotated[int | None, typer.Option(help="Batch of every stage.")] = None,
-    optimizer: Annotated[str | None, typer.Option(help="muon or adamw.")] = None,
+    optimizer: Annotated[
+        str | None, typer.Option(help="muon, or adamw at about half the learning rate [muon].")
+    ] = None,
     lr: Annotated[float | None, typer.Option(help="Peak learning rate.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, order and augmentation.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu, cuda.")] = None,

@@ -127,7 +127,7 @@ class GKNet(HeatmapNetwork):
         return self._node_maps(self.decoder(memory, glance), places)
 
     def _node_maps(self, nodes: Float[Tensor, "b n c"], places: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
-        # (b, n, p + 1), the last one a bias; scaled so that one step of Adam moves a map by little
+        # (b, n, p + 1), the last one a bias; scaled so that one step moves a map by little
         filters = self.node_filter(nodes) / self.node_filter.out_features
         maps = filters[:, :, :-1] @ places.flatten(2) + filters[:, :, -1:]
         return maps.reshape(*maps.shape[:2], *places.shape[2:])

@@ -85,7 +85,7 @@ class TrainSettings:
         if (self.minutes is None) == (self.epochs is None):
             raise GknetError("train: give either --minutes or --epochs")
         for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):
-            if getattr(self, name) <= 0:
+            if not getattr(self, name) > 0:  # nan is not
                 raise GknetError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if not 0 <= self.ema < 1 or not 0 <= self.warm_up < 1:
             raise GknetError(f"ema and warm_up: expected values in [0, 1), got {self.ema} and {self.warm_up}")
