@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from gknet.network.backbone import position_code  # noqa: E402
 from gknet.network.build import gknet_s, gknet_xs  # noqa: E402
 from gknet.network.gknet import GKNet  # noqa: E402
 from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
+from gknet.network.heatmap import SHARPNESS, Hints  # noqa: E402
 from tests.network.tiny import chain, tiny  # noqa: E402
 
 
@@ -95,24 +96,79 @@ def test_a_message_knows_both_of_its_ends() -> None:
     assert not told[2].any()
 
 
-def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> None:
-    """Certain maps of the other branch: each node sees the code of the one place, nothing else."""
-    network = tiny(5).eval()
+def glances_at(pixels: torch.Tensor, hints: Hints | None = None) -> list[torch.Tensor]:
+    """Codes of the places (n, 34) that nodes see where the other branch has the maps `pixels`, at each glance."""
+    network = tiny(pixels.shape[1]).eval()
     assert network.decoder is not None
     with torch.no_grad():
         network.node_filter.weight.zero_()
-        network.pixel_head.weight.zero_()
+        network.node_filter.bias.zero_()
     glances: list[torch.Tensor] = []
     for layer in network.decoder.layers:
-        layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0]))
-    up, memory = torch.randn(1, 8, 16, 16), torch.randn(1, 6, 8)
+        layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0][0, :, 8:]))
+    network._graph_maps(torch.randn(1, 6, 8), torch.randn(1, 8, 16, 16), pixels, hints)
+    assert len(glances) == 4  # two layers, two looks
+    return glances
+
+
+def code(rows: Sequence[int], columns: Sequence[int]) -> torch.Tensor:
+    return position_code(16, 16, torch.zeros(1))[:, rows, columns].T
+
+
+def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> None:
+    """Certain maps of the other branch: each node sees the code of the one place, nothing else."""
     pixels = torch.zeros(1, 5, 16, 16)
     for k in range(5):
         pixels[0, k, 2 * k, 4] = 10
-    network._graph_maps(memory, up, pixels)
-    assert len(glances) == 2
-    for seen in glances:
-        torch.testing.assert_close(seen[0, :, 8:], position_code(16, 16, up)[:, :10:2, 4].T, atol=1e-5, rtol=1e-4)
+    for seen in glances_at(pixels):
+        torch.testing.assert_close(seen, code([0, 2, 4, 6, 8], [4] * 5), atol=1e-5, rtol=1e-4)
+
+
+def test_in_the_second_look_a_node_takes_a_side() -> None:
+    """Between two places at .6 and .4 it sees their mean at first, then .84 of the likelier: .6^4 / (.6^4 + .4^4)."""
+    pixels = torch.full((1, 2, 16, 16), -10.0)
+    pixels[0, :, 3, 2] = np.log(0.6) / SHARPNESS
+    pixels[0, :, 12, 9] = np.log(0.4) / SHARPNESS
+    likelier, other = code([3], [2]), code([12], [9])
+    share = 0.6**4 / (0.6**4 + 0.4**4)
+    first, second = glances_at(pixels)[1:3]
+    torch.testing.assert_close(first, (0.6 * likelier + 0.4 * other).expand(2, -1), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(second, (share * likelier + (1 - share) * other).expand(2, -1), atol=1e-5, rtol=1e-4)
+
+
+def test_a_node_that_is_told_sees_the_truth_in_its_second_look_alone() -> None:
+    pixels, truth = torch.zeros(1, 3, 16, 16), torch.zeros(1, 3, 16, 16)
+    pixels[0, :, 5, 5] = 10
+    truth[0, :, 11, 7] = 0.25  # maps of any sum
+    glances = glances_at(pixels, Hints(truth, torch.tensor([[True, False, True]])))
+    for seen in glances[:2]:
+        torch.testing.assert_close(seen, code([5, 5, 5], [5, 5, 5]), atol=1e-5, rtol=1e-4)
+    for seen in glances[2:]:
+        torch.testing.assert_close(seen, code([11, 5, 11], [7, 5, 7]), atol=1e-5, rtol=1e-4)
+
+
+def test_what_a_node_is_told_reaches_its_neighbours_in_the_second_look() -> None:
+    for graph, heard in (("identity", False), ("skeleton", True)):
+        network = tiny(5, graph).eval()
+        torch.nn.init.normal_(network.node_filter.weight)
+        image, truth = torch.rand(1, 3, 64, 64), torch.zeros(1, 5, 16, 16)
+        truth[0, 0, 2, 3] = 1
+        told = torch.zeros(1, 5, dtype=torch.bool)
+        before = network.branches(image, Hints(truth, told))
+        told[0, 0] = True
+        after = network.branches(image, Hints(truth, told))
+        assert before.nodes is not None
+        assert after.nodes is not None
+        changed = (before.nodes - after.nodes).abs().amax(dim=(0, 2, 3)) > 1e-5
+        assert changed.tolist() == [True, heard, heard, False, False]  # two layers, two edges far
+        torch.testing.assert_close(before.first, after.first)
+
+
+def test_a_network_that_looks_once_takes_no_hints() -> None:
+    assert tiny(4).looks_twice
+    for network in (tiny(4, "none"), gknet_s(chain(4))):
+        assert not network.looks_twice
+        assert network.branches(torch.rand(1, 3, 64, 64)).first is None
 
 
 @pytest.mark.parametrize("glances", [True, False])

@@ -69,7 +69,7 @@ def gknet_xs(adjacency: Bool[ndarray, "n n"], graph: str = "skeleton", loss: str
     """
     if graph == "none":
         return GKNet(GKNetConfig(width=17, pyramid_width=32, node_width=64, heads=4, graph=graph), adjacency, loss)
-    config = GKNetConfig(width=16, pyramid_width=28, node_width=64, node_layers=3, heads=4, graph=graph)
+    config = GKNetConfig(width=16, pyramid_width=26, node_width=64, node_layers=3, heads=4, graph=graph)
     return GKNet(config, adjacency, loss)
 
 

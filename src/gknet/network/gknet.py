@@ -21,7 +21,10 @@ from gknet.network.backbone import (
     position_code,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
-from gknet.network.heatmap import Branches, HeatmapNetwork, log_belief
+from gknet.network.heatmap import Branches, HeatmapNetwork, Hints, log_belief
+
+CONVICTION = 4
+"""Power to which the first look's belief is raised before the second: whoever is in two minds takes a side."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class GKNetConfig:
     node_width     channels of a graph node and of the image cells that it attends to
     node_layers    layers of the graph decoder
     heads          attention heads
-    glances        whether nodes see, between layers, what is where they believe their keypoints to be (decision 0012)
+    glances        whether nodes see, between layers, what is where they believe their keypoints to be (decision 0012),
+                   and look twice (decision 0013)
     graph          "skeleton", "identity" (no edges), "random" (as many edges, anywhere) or "none" (no graph branch)
     """
 
@@ -60,6 +64,7 @@ class GKNet(HeatmapNetwork):
     def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"], loss: str = "likelihood") -> None:
         super().__init__(loss, stride=4)
         self.config = config
+        self.looks_twice = config.glances and config.graph != "none"
         keypoints = len(adjacency)
         self.encoder = Encoder(config.width)
         widths = self.encoder.widths
@@ -89,7 +94,8 @@ class GKNet(HeatmapNetwork):
         nn.init.zeros_(self.node_filter.bias)
         self.fusion = Fusion(len(adjacency))
 
-    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+    def branches(self, image: Float[Tensor, "b 3 h w"], hints: Hints | None = None) -> Branches:
+        """The maps of both branches; `hints` are what some nodes are told before their second look."""
         check_input(image)
         features = self.encoder(image)
         coarse = features[3]
@@ -100,8 +106,8 @@ class GKNet(HeatmapNetwork):
         if self.decoder is None:
             return Branches(pixels, pixels, None)
         memory = torch.cat([cells, self._cells(self.fine_cells(features[2]))], dim=1)
-        nodes = self._graph_maps(memory, up, pixels)
-        return Branches(self.fusion(pixels, nodes), pixels, nodes)
+        nodes, first = self._graph_maps(memory, up, pixels, hints)
+        return Branches(self.fusion(pixels, nodes), pixels, nodes, first)
 
     def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
         """A map as a list of cells that know where they are."""
@@ -109,22 +115,37 @@ class GKNet(HeatmapNetwork):
         return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
 
     def _graph_maps(
-        self, memory: Float[Tensor, "b m c"], up: Float[Tensor, "b p h w"], pixels: Float[Tensor, "b n h w"]
-    ) -> Float[Tensor, "b n h w"]:
-        """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is."""
+        self,
+        memory: Float[Tensor, "b m c"],
+        up: Float[Tensor, "b p h w"],
+        pixels: Float[Tensor, "b n h w"],
+        hints: Hints | None,
+    ) -> tuple[Float[Tensor, "b n h w"], Float[Tensor, "b n h w"] | None]:
+        """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is.
+
+        In the second look it sees what is where the first one put it, and so do its neighbours by its messages.
+        Returns its map, and what the first look made of both branches.
+        """
         assert self.decoder is not None
         code = position_code(up.shape[2], up.shape[3], up)
         along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
         places = functional.relu(self.pixel_features(up) + along)
         if not self.config.glances:
-            return self._node_maps(self.decoder(memory), places)
+            return self._node_maps(self.decoder(memory), places), None
         seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
 
         def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
             # A plain sum: the fusion would be a way from node to node beside the edges.
             return log_belief(pixels + self._node_maps(nodes, places)).exp() @ seen
 
-        return self._node_maps(self.decoder(memory, glance), places)
+        first = pixels + self._node_maps(self.decoder(memory, glance), places)
+        belief = (CONVICTION * log_belief(first.detach())).softmax(dim=2)
+        if hints is not None:
+            truth = hints.maps.flatten(2)
+            truth = truth / truth.sum(dim=2, keepdim=True).clamp(min=1e-12)
+            belief = torch.where(hints.told[:, :, None], truth, belief)
+        found = belief @ seen
+        return self._node_maps(self.decoder(memory, lambda nodes: found), places), first
 
     def _node_maps(self, nodes: Float[Tensor, "b n c"], places: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
         # (b, n, p + 1), the last one a bias; scaled so that one step moves a map by little

@@ -43,11 +43,25 @@ def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"
 
 
 class Branches(NamedTuple):
-    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch."""
+    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch.
+
+    first  the maps of the first look of a network that looks twice, else None
+    """
 
     fused: Tensor
     pixels: Tensor
     nodes: Tensor | None
+    first: Tensor | None = None
+
+
+class Hints(NamedTuple):
+    """Some keypoints' true places, told to a network in training before its second look.
+
+    maps (b, n, h, w) the target Gaussians; told (b, n) bool, whose place is told
+    """
+
+    maps: Tensor
+    told: Tensor
 
 
 class HeatmapNetwork(nn.Module, ABC):
@@ -59,6 +73,8 @@ class HeatmapNetwork(nn.Module, ABC):
 
     stride: int
     input_size = 256
+    looks_twice = False
+    """Whether `branches` takes hints, as GKNet's does."""
 
     def __init__(self, loss: str, stride: int) -> None:
         super().__init__()

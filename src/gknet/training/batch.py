@@ -30,18 +30,23 @@ from gknet.training.schedule import Stage
 AHEAD = 3
 """Batches prepared ahead of the loop."""
 
+TOLD_OF, MOST_TOLD = 0.5, 0.6
+"""Share of the pictures with hints, and the largest share of such a picture's keypoints that are told."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
     """A network's input and what is to be found in it: points in input pixels, and the pose.
 
     image (s, s, 3) uint8; points_px (k, 2); weight (k,) 1 where the point counts, 0 where it is out of view
+    told (k,) whether a network that looks twice is told the point before it looks again
     pose (7,) as the input shows it, `CropPose.vector`; NaN where it has none to show
     """
 
     image: UInt8[ndarray, "s s 3"]
     points_px: Float[ndarray, "k 2"]
     weight: Float[ndarray, "k"]
+    told: Bool[ndarray, "k"]
     pose: Float[ndarray, "7"]
 
 
@@ -55,6 +60,7 @@ class Batch:
     image: UInt8[Tensor, "b s s 3"]
     points_px: Float[Tensor, "b k 2"]
     weight: Float[Tensor, "b k"]
+    told: Bool[Tensor, "b k"]
     pose: Float[Tensor, "b 7"]
     position: int
 
@@ -79,7 +85,12 @@ def draw_keypoints(rng: np.random.Generator, cache: Cache, row: int, size: int) 
     warped = warp_points(matrix, points)
     seen = in_view & points_inside(warped, size)
     points_px = np.where(seen[:, None], warped, 0.0).astype(np.float32)
-    return Sample(image, points_px, seen.astype(np.float32), _warped_pose(cache, row, matrix, size))
+    told = seen & (rng.random(len(points)) < _share_told(rng))
+    return Sample(image, points_px, seen.astype(np.float32), told, _warped_pose(cache, row, matrix, size))
+
+
+def _share_told(rng: np.random.Generator) -> float:
+    return rng.uniform(0, MOST_TOLD) if rng.random() < TOLD_OF else 0.0
 
 
 def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
@@ -90,7 +101,7 @@ def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sam
     low, high = corners.min(axis=0), corners.max(axis=0)
     seen = float((high - low).min() > size / 64)
     points_px, weight = np.stack([low, high]).astype(np.float32), np.full(2, seen, dtype=np.float32)
-    return Sample(image, points_px, weight, _warped_pose(cache, row, matrix, size))
+    return Sample(image, points_px, weight, np.zeros(2, dtype=bool), _warped_pose(cache, row, matrix, size))
 
 
 def _warped_pose(cache: Cache, row: int, matrix: Float[ndarray, "3 3"], size: int) -> Float[ndarray, "7"]:
@@ -128,6 +139,7 @@ class Loader:
             torch.from_numpy(np.stack([sample.image for sample in samples])),
             torch.from_numpy(np.stack([sample.points_px for sample in samples])),
             torch.from_numpy(np.stack([sample.weight for sample in samples])),
+            torch.from_numpy(np.stack([sample.told for sample in samples])),
             torch.from_numpy(np.stack([sample.pose for sample in samples])),
             position + stage.batch * self.world,
         )

@@ -13,11 +13,15 @@ from torch import Tensor, nn
 from gknet.direct import AttitudeBins
 from gknet.frame import Frame
 from gknet.network.dmanet import DMANet
-from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork
+from gknet.network.gknet import GKNet
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork, Hints
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
 from gknet.training.loss import direct_loss, gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
 from gknet.training.validation import Validation, validate_direct, validate_keypoints, validate_locator
+
+FIRST_LOOK = 0.5
+"""Weight of the loss on a first look."""
 
 LOSSES = {"likelihood": likelihood_loss, "squared": heatmap_loss}
 
@@ -35,7 +39,11 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class KeypointTask:
-    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss."""
+    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss.
+
+    A network that looks twice answers for its first look too, and is told some of the places before the second, so
+    that it learns what neighbours tell of a keypoint; for those that it was told it does not answer.
+    """
 
     spacecraft: Spacecraft
     input_size: int
@@ -45,11 +53,19 @@ class KeypointTask:
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
         keypoint_network = cast(HeatmapNetwork, network)
         measure = LOSSES[keypoint_network.loss]
-        branches = keypoint_network.branches(batch.network_input(device))
-        height, width = branches.fused.shape[2:]
+        image = batch.network_input(device)
+        height, width = (length // keypoint_network.stride for length in image.shape[2:])
         points, weight = batch.points_px.to(device), batch.weight.to(device)
         targets = gaussian_targets(points, keypoint_network.stride, height, width, SIGMA_CELLS)
-        loss = measure(branches.fused, targets, weight)
+        loss = torch.zeros((), device=device)
+        if keypoint_network.looks_twice:
+            told = batch.told.to(device)
+            branches = cast(GKNet, network).branches(image, Hints(targets, told))
+            loss = loss + FIRST_LOOK * measure(cast(Tensor, branches.first), targets, weight)
+            weight = weight * ~told
+        else:
+            branches = keypoint_network.branches(image)
+        loss = loss + measure(branches.fused, targets, weight)
         if self.auxiliary > 0 and branches.nodes is not None:
             parts = measure(branches.pixels, targets, weight) + measure(branches.nodes, targets, weight)
             loss = loss + self.auxiliary * parts
