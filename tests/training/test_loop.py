@@ -135,6 +135,7 @@ def test_exports_agree_with_torch_and_know_what_they_are(
         assert size == load_run(run).input_size == 64  # the last stage's
         assert network(np.zeros((2, 3, size, size), np.float32)).shape == (2, channels, size // 4, size // 4)
         assert result.onnx_path.stat().st_size < 0.65 * 4 * sum(t.numel() for t in load_weights(run / BEST).values())
+        assert b"site-packages" not in result.onnx_path.read_bytes()  # no traces of the machine that exported it
         again = load_weights(result.weights_path)
         for name, tensor in load_weights(run / BEST).items():
             torch.testing.assert_close(again[name], tensor, atol=1e-3, rtol=1e-3)

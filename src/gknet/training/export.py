@@ -94,7 +94,10 @@ def onnx_graph(network: Network, example: Float[Tensor, "b 3 s s"]) -> onnx.Mode
             verbose=False,
         )
     assert program is not None
-    return program.model_proto
+    model = program.model_proto
+    for node in model.graph.node:  # stack traces with the paths of this machine, a quarter of a megabyte and more
+        del node.metadata_props[:]
+    return model
 
 
 def store_in_half(model: onnx.ModelProto) -> None:
