@@ -57,7 +57,7 @@ def read(folder: Path) -> tuple[Trials, dict[str, list[dict]]]:
             for protocol, values in content.pop("protocols").items():
                 trial = Trial.from_dict(values)
                 trials[content["name"], trial.spacecraft, protocol].append(trial)
-            costs[content["name"]].append(content)
+            costs[content["name"]].append(content | {"spacecraft": trial.spacecraft})
         except (OSError, ValueError, LookupError, TypeError, AttributeError, GknetError) as error:
             raise GknetError(f"{path}: not a result of recipes/paper_tables.py ({error}); delete it") from error
     if not trials:
@@ -159,6 +159,20 @@ def cost_table(costs: dict[str, list[dict]]) -> str:
     return markdown([*header, "trainings"], rows)
 
 
+def curve_table(costs: dict[str, list[dict]]) -> str:
+    """Validation RMSE along the training, mean over the seeds: how many pictures it takes."""
+    curves: dict[tuple[str, str], list[list[list[float]]]] = defaultdict(list)
+    for name, found in costs.items():
+        for content in found:
+            curves[content["spacecraft"], name].append(content["curve"])
+    rows = []
+    for (spacecraft, name), found in sorted(curves.items()):
+        pictures, rmse = np.mean(found, axis=0).T  # (validations, 2)
+        words = ", ".join(f"{value:.1f}" for value in rmse)
+        rows.append([spacecraft, name, words, f"{pictures[-1]:.0f}", str(len(found))])
+    return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "pictures seen there", "seeds"], rows)
+
+
 def swap_table(trials: Trials, protocol: str = "oracle") -> str:
     """Of the detections in view: at their own keypoint, at another one (a swap), at none."""
     rows = []
@@ -184,6 +198,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str) -> str:
         "and seeds with 95 % intervals, bootstrapped over sequences and seeds; pixels of the 256 crop, radians.",
         "## Cost\n" + cost_table(costs),
     ]
+    parts.append("## While training: RMSE in px on validation frames, oracle crop\n" + curve_table(costs))
     hybrid = tuple(name for name in ORDER if name != DIRECT)
     for protocol, words in PROTOCOLS.items():
         parts.append(f"## Table 1, RMSE in px: {words}\n" + rmse_table(trials, hybrid, protocol))

@@ -26,6 +26,7 @@ locators, the same for every method.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import shutil
 import time
@@ -190,7 +191,7 @@ def main() -> None:
         export_run(run, model)
         shutil.copyfile(arguments.locators / spacecraft / "locator.onnx", model / "locator.onnx")
         content = judge(work, model, method, spacecraft, seed)
-        content |= {"learning_rate": settings.learning_rate, "minutes": minutes, "samples": samples_seen(run)}
+        content |= {"learning_rate": settings.learning_rate, "minutes": minutes, **seen(run)}
         write_text(result_path(results, method, spacecraft, seed), json.dumps(content) + "\n")
 
 
@@ -270,10 +271,15 @@ def run_training(work: Path, spacecraft: str, out: Path, settings: TrainSettings
     return round(state.elapsed_s / 60, 2)
 
 
-def samples_seen(run: Path) -> int:
-    """Of the whole run, from the last row of its metrics."""
-    header, *rows = (run / "metrics.csv").read_text(encoding="utf-8").splitlines()
-    return int(float(rows[-1].split(",")[header.split(",").index("samples")]))
+def seen(run: Path) -> dict[str, object]:
+    """Pictures seen by the whole run, and its validation RMSE in px along the way, from its metrics."""
+    with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    pictures = [int(float(row["samples"])) for row in rows]
+    curve = [
+        [count, float(row["val_rmse_px"])] for count, row in zip(pictures, rows, strict=True) if row["val_rmse_px"]
+    ]
+    return {"samples": pictures[-1], "curve": curve}
 
 
 def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -> dict[str, object]:
