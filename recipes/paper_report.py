@@ -4,7 +4,7 @@
 
 Hardware   any
 Time       seconds
-Expected   RESULTS/SCALE/README.md; it says what is missing when trainings are
+Expected   RESULTS/SCALE/README.md and its charts; it says what is missing when trainings are
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from gknet.atomic import write_text
 from gknet.comparison import LOW_VISIBILITY, Interval, Trial, difference, mean_of
 from gknet.errors import GknetError, ends_in_one_line
 from gknet.fleet import NAMES
+from gknet.report.chart import Axis, Series, bar_chart, standalone
 
 PAPER_RMSE = {
     "HRNet": (6.12, 74.69, 32.64),
@@ -69,14 +70,19 @@ def shown(interval: Interval) -> str:
     return f"{interval.mean:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
 
 
-def cell(trials: Trials, name: str, spacecraft: str, protocol: str, metric: str) -> str:
-    found = trials.get((name, spacecraft, protocol))
-    if not found:
-        return "not run"
+def interval(trials: Trials, name: str, spacecraft: str, protocol: str, metric: str) -> Interval | None:
+    """None where no frame has a value, as of hidden keypoints where none is hidden."""
     try:
-        return shown(mean_of(found, metric))
+        return mean_of(trials[name, spacecraft, protocol], metric)
     except GknetError:
-        return "-"
+        return None
+
+
+def cell(trials: Trials, name: str, spacecraft: str, protocol: str, metric: str) -> str:
+    if not trials.get((name, spacecraft, protocol)):
+        return "not run"
+    found = interval(trials, name, spacecraft, protocol, metric)
+    return "-" if found is None else shown(found)
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:
@@ -190,12 +196,26 @@ def swap_table(trials: Trials, protocol: str = "oracle") -> str:
     return markdown(["graph", *NAMES], rows)
 
 
-def page(trials: Trials, costs: dict[str, list[dict]], scale: str) -> str:
+def bars(trials: Trials, spacecraft: str) -> str:
+    """RMSE of every method that detects keypoints, of all and of the hidden ones, as an SVG file."""
+    names = [name for name in (*ORDER, *GRAPHS[1:]) if name != DIRECT and trials.get((name, spacecraft, "oracle"))]
+    series = []
+    for words, metric in (("all keypoints", "rmse_px"), ("hidden", "rmse_hidden_px")):
+        found = [interval(trials, name, spacecraft, "oracle", metric) for name in names]
+        rows = [(each.mean, each.low, each.high) if each else (np.nan,) * 3 for each in found]
+        mean, low, high = np.array(rows).T
+        series.append(Series(words, np.arange(len(names)), mean, low, high))
+    title = f"{spacecraft}, oracle crop"
+    return standalone(bar_chart(title, Axis("mean RMSE, px of the 256 crop"), names, series))
+
+
+def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: list[str]) -> str:
     parts = [
         f"# The paper's tables, scale `{scale}`",
         "Made by `recipes/paper_tables.py` and `recipes/paper_report.py`; the method, the differences from the paper "
         "and what follows from the figures are in [docs/paper.md](../../../docs/paper.md). Means over the test frames "
         "and seeds with 95 % intervals, bootstrapped over sequences and seeds; pixels of the 256 crop, radians.",
+        *[f"![RMSE of the methods on {Path(name).stem}]({name})" for name in pictures],
         "## Cost\n" + cost_table(costs),
     ]
     parts.append("## While training: RMSE in px on validation frames, oracle crop\n" + curve_table(costs))
@@ -233,7 +253,13 @@ def main() -> None:
     parser.add_argument("--scale", default="cpu", help="its sub-folder")
     arguments = parser.parse_args()
     folder = arguments.results / arguments.scale
-    text = page(*read(folder), arguments.scale)
+    trials, costs = read(folder)
+    pictures = []
+    for spacecraft in NAMES:
+        if any(craft == spacecraft and name != DIRECT for name, craft, _ in trials):
+            pictures.append(f"{spacecraft}.svg")
+            write_text(folder / pictures[-1], bars(trials, spacecraft))
+    text = page(trials, costs, arguments.scale, pictures)
     write_text(folder / "README.md", text)
     print(text)
 

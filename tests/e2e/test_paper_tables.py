@@ -53,6 +53,8 @@ def test_smoke(tmp_path: Path) -> None:
     for words_of_a_table in ("Table 1", "Table 2", "Table 3", "Swaps", "29.11", "0.763"):
         assert words_of_a_table in text
     assert "nan" not in text
+    assert f"({CRAFT}.svg)" in text
+    assert "GKNet, no edges" in (folder / f"{CRAFT}.svg").read_text(encoding="utf-8")
     for table in text.split("## ")[1:]:
         title = table.split("\n")[0]
         assert ("DMANet" in table) == any(word in title for word in ("Cost", "training", "Table 2", "DMANet")), title

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gknet.errors import GknetError
-from gknet.report.chart import Axis, Series, _linear_ticks, _log_ticks, bar_chart, curve_chart
+from gknet.report.chart import Axis, Series, _linear_ticks, _log_ticks, bar_chart, curve_chart, standalone
 
 
 def texts(svg: str) -> list[str]:
@@ -81,3 +81,13 @@ def test_log_ticks_are_inside(low: float, high: float) -> None:
     assert 2 <= len(ticks) <= 12
     assert low * 0.99 <= min(ticks)
     assert max(ticks) <= high * 1.01
+
+
+def test_a_chart_of_its_own_is_a_whole_svg_file_with_its_colours() -> None:
+    chart = bar_chart("a < b", Axis("px"), ["one"], [Series("", np.zeros(1), np.ones(1))])
+    root = ElementTree.fromstring(standalone(chart))
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert root.get("viewBox") == ElementTree.fromstring(chart).get("viewBox")
+    (style,) = (child for child in root if child.tag.endswith("style"))
+    assert "--s0:" in (style.text or "")
+    assert len([*root.iter()]) == len([*ElementTree.fromstring(chart).iter()]) + 1

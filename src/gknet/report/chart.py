@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib import resources
 
 import numpy as np
 from jaxtyping import Float
@@ -91,6 +92,17 @@ def bar_chart(title: str, value: Axis, names: Sequence[str], series: Sequence[Se
         parts.append(f'<text x="{left - 7:.1f}" y="{middle:.1f}" text-anchor="end">{escape(name)}</text>')
         parts += [_bar(k, s, row, across, top + k * thick, thick - 1.5) for k, s in enumerate(series)]
     return _svg(title, "".join(parts), height)
+
+
+def standalone(chart: str) -> str:
+    """A chart as an SVG file of its own, with the page's style in it."""
+    opening, content = chart.split(">", 1)
+    opening = opening.replace("<svg", f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}"', 1)
+    return f"{opening}><style>{page_style()}</style>{content}\n"
+
+
+def page_style() -> str:
+    return (resources.files("gknet.report") / "page.css").read_text(encoding="utf-8")
 
 
 def empty_chart(title: str, note: str) -> str:

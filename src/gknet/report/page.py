@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import resources
 
 from gknet import __version__
 from gknet.evaluation import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, Run
 from gknet.metrics import Statistic
+from gknet.report.chart import page_style
 from gknet.report.gallery import Gallery
 from gknet.report.plots import charts
 from gknet.report.table import (
@@ -34,7 +34,6 @@ class Section:
 
 def page(title: str, sections: Sequence[Section]) -> str:
     """The whole page; every number in its tables carries its full value in `data-value`."""
-    style = (resources.files("gknet.report") / "page.css").read_text(encoding="utf-8")
     body = "".join(_section(section) for section in sections)
     links = "".join(
         f'<a href="#{escape(s.evaluation.spacecraft.name)}">{escape(s.evaluation.spacecraft.name)}</a>'
@@ -44,7 +43,7 @@ def page(title: str, sections: Sequence[Section]) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><main>"
+        f"<title>{escape(title)}</title><style>{page_style()}</style></head><body><main>"
         f'<header><h1>{escape(title)}</h1><p class="quiet">gknet {__version__}</p>{contents}</header>'
         f"{body}{_glossary()}</main></body></html>\n"
     )
