@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from gknet.errors import GknetError
-from gknet.frame import Estimate, Keypoints
+from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.metrics import nees, pose_error_vector
 from gknet.pnp import PnpResult, PnpSettings, solve_pnp
@@ -187,3 +187,80 @@ def test_a_keypoint_off_by_many_of_its_sigmas_loses_its_pull() -> None:
         result = solved(Keypoints(pixels, keypoints.score, covariance))
         off.append(np.linalg.norm(pose_error_vector(POSE, result.cam_from_body)))
     assert off[0] < 0.1 * off[1]
+
+
+def box_of(pose: Pose, camera: Camera = CAMERA) -> Box:
+    """About all keypoints, cut to the image."""
+    box = Box.around(camera.project(pose.transform(POINTS))).clipped(camera.width, camera.height)
+    assert box is not None
+    return box
+
+
+def with_box(keypoints: Keypoints, box: Box | None) -> PnpResult:
+    result = solve_pnp(keypoints, CAMERA, POINTS, box=box)
+    assert isinstance(result, PnpResult), result
+    return result
+
+
+def test_the_box_tells_the_range_where_keypoints_leave_it_open() -> None:
+    """Ten very unsure keypoints, the others not detected."""
+    generator = np.random.default_rng(2)
+    errors = []
+    for _ in range(30):
+        pose = Pose.from_quaternion(generator.normal(size=4), [0.5, 0.3, generator.uniform(10, 20)])
+        clean = seen(pose, sigma_px=60)
+        vague = noisy(Keypoints(clean.pixels, np.where(np.arange(16) < 10, 0.5, 0.0), clean.covariance_px2), generator)
+        settings = PnpSettings(threshold_px=(300.0,), max_rms_px=400)
+        for box in (None, box_of(pose)):
+            result = solve_pnp(vague, CAMERA, POINTS, 1.0, settings, box)
+            assert isinstance(result, PnpResult)
+            errors.append(abs(np.log(np.linalg.norm(result.cam_from_body.translation_m) / pose.translation_m[2])))
+    without, helped = np.median(np.reshape(errors, (-1, 2)), axis=0)
+    assert helped < 0.08
+    assert helped < 0.7 * without
+
+
+def test_a_wrong_box_hardly_moves_a_sure_pose() -> None:
+    box = box_of(POSE)
+    for wrong in (
+        Box(box.x0 - 0.1 * box.side, box.y0 - 0.1 * box.side, box.x1 + 0.1 * box.side, box.y1 + 0.1 * box.side),
+        Box(700.0, 100.0, 900.0, 300.0),
+    ):
+        found = with_box(seen(POSE), wrong).cam_from_body
+        assert 0 < np.linalg.norm(found.translation_m - POSE.translation_m) < 2e-3 * POSE.translation_m[2]
+
+
+def test_an_edge_that_the_image_cuts_tells_nothing() -> None:
+    keypoints = noisy(seen(POSE, sigma_px=3), np.random.default_rng(3))
+    without = with_box(keypoints, None)
+    cut = with_box(keypoints, Box(0.0, 0.0, float(CAMERA.width), float(CAMERA.height)))
+    np.testing.assert_array_equal(cut.cam_from_body.rotation, without.cam_from_body.rotation)
+    np.testing.assert_array_equal(cut.covariance, without.covariance)
+    part = with_box(keypoints, Box(0.0, 0.0, box_of(POSE).x1, float(CAMERA.height)))
+    assert not np.array_equal(part.covariance, without.covariance)
+
+
+def test_covariance_counts_the_box() -> None:
+    """Monte-Carlo over noisy keypoints and noisy edges: the NEES is 6 in the mean."""
+    generator = np.random.default_rng(4)
+    settings = PnpSettings(threshold_px=(60.0,), max_rms_px=100, box_sigma=0.01)
+    box, truth = box_of(POSE), seen(POSE, sigma_px=6)
+    squared = []
+    for _ in range(300):
+        keypoints = noisy(truth, generator)
+        edges = np.array([box.x0, box.y0, box.x1, box.y1]) + generator.normal(scale=0.01 * box.side, size=4)
+        result = solve_pnp(keypoints, CAMERA, POINTS, 1.0, settings, Box(*edges.tolist()))
+        assert isinstance(result, PnpResult)
+        found = nees(POSE, Estimate(keypoints, result.cam_from_body, result.covariance, result.inliers, 0.0))
+        assert found is not None
+        squared.append(found)
+    assert np.mean(squared) == pytest.approx(6, rel=0.2)
+    alone, helped = (solve_pnp(truth, CAMERA, POINTS, 1.0, settings, each) for each in (None, box))
+    assert isinstance(alone, PnpResult)
+    assert isinstance(helped, PnpResult)
+    assert helped.covariance[5, 5] < 0.8 * alone.covariance[5, 5]
+
+
+def test_a_box_without_a_sigma_is_an_error() -> None:
+    with pytest.raises(GknetError, match="sigma of the box"):
+        PnpSettings(box_sigma=0)

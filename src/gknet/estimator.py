@@ -65,7 +65,7 @@ class Estimator(CropEstimator):
 
     def pose_of(self, keypoints: Keypoints, camera: Camera, box: Box, crop: Crop) -> Estimate:
         """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none."""
-        result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp)
+        result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp, box)
         if not isinstance(result, PnpResult):
             return Estimate(keypoints, box=box, failure=result)
         contradiction = self.contradiction(result.cam_from_body, camera, crop)

@@ -1,8 +1,10 @@
-"""Keypoints to a pose with its covariance: PoseLib's LO-RANSAC, then a robust refinement whitened by covariances."""
+"""Keypoints to a pose with its covariance: PoseLib's LO-RANSAC, then a robust refinement whitened by covariances, in
+which the box that the spacecraft was found in has a say too."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,7 +13,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Keypoints
+from gknet.frame import Box, Keypoints
 from gknet.geometry import Camera, Pose
 
 ROBUST_SIGMAS = 3.0
@@ -28,6 +30,7 @@ class PnpSettings:
     threshold_px     a keypoint nearer than this to its projection is an inlier; tried in order until a pose comes
     min_inliers      and at least this fraction of the keypoints used
     max_rms_px       of the inliers' reprojection errors
+    box_sigma        standard deviation of an edge of the spacecraft's box, as a share of the box's longer side
     covariance_scale of the pose: keypoints of one picture err alike, more than independent ones; from calibration.py
     """
 
@@ -36,11 +39,14 @@ class PnpSettings:
     min_inliers: int = 5
     min_inlier_fraction: float = 0.3
     max_rms_px: float = 10.0
+    box_sigma: float = 0.1
     covariance_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.threshold_px or min(self.threshold_px) <= 0:
             raise GknetError(f"pnp: expected positive thresholds, got {self.threshold_px}")
+        if not self.box_sigma > 0:
+            raise GknetError(f"pnp: expected a positive sigma of the box, got {self.box_sigma}")
         if not self.covariance_scale > 0:
             raise GknetError(f"pnp: expected a positive covariance scale, got {self.covariance_scale}")
 
@@ -56,13 +62,30 @@ class PnpResult:
 
 
 @dataclass(frozen=True, eq=False)
+class _Edges:
+    """Left, top, right and bottom of the spacecraft's box, and which lie inside the image: the others are cuts."""
+
+    at_px: Float[ndarray, "4"]
+    inside: Bool[ndarray, "4"]
+    sigma_px: float
+    points_m: Float[ndarray, "n 3"]
+
+    @staticmethod
+    def of(box: Box, camera: Camera, points_m: Float[ndarray, "n 3"], sigma: float) -> _Edges:
+        at = np.array([box.x0, box.y0, box.x1, box.y1])
+        inside = np.array([box.x0 > 1, box.y0 > 1, box.x1 < camera.width - 1, box.y1 < camera.height - 1])
+        return _Edges(at, inside, sigma * box.side, points_m)
+
+
+@dataclass(frozen=True, eq=False)
 class _Problem:
-    """The usable keypoints, measured in (possibly distorted) image pixels."""
+    """The usable keypoints, measured in (possibly distorted) image pixels, and the box about all of them."""
 
     pixels: Float[ndarray, "k 2"]
     information: Float[ndarray, "k 2 2"]
     points_m: Float[ndarray, "k 3"]
     camera: Camera
+    edges: _Edges | None
 
 
 def solve_pnp(
@@ -71,10 +94,12 @@ def solve_pnp(
     points_m: Float[ndarray, "n 3"],
     input_px: float = 1.0,
     settings: PnpSettings | None = None,
+    box: Box | None = None,
 ) -> PnpResult | str:
     """The pose that explains the keypoints, or the reason why there is none.
 
     input_px   size of one pixel of the network's input in image pixels (1 / Crop.scale)
+    box        about all keypoints, hidden or not, cut to the image; it tells the range where keypoints leave it open
     The same input gives the same bits: the sampling has a fixed seed.
     """
     settings = settings or PnpSettings()
@@ -83,8 +108,9 @@ def solve_pnp(
     usable = _usable(keypoints, settings.min_score)
     if usable.sum() < 4:
         return f"only {usable.sum()} keypoints are sure enough, a pose needs 4"
+    edges = None if box is None else _Edges.of(box, camera, points_m, settings.box_sigma)
     problem = _Problem(
-        keypoints.pixels[usable], np.linalg.inv(keypoints.covariance_px2[usable]), points_m[usable], camera
+        keypoints.pixels[usable], np.linalg.inv(keypoints.covariance_px2[usable]), points_m[usable], camera, edges
     )
     result: PnpResult | str = "no keypoint threshold was tried"
     for threshold in settings.threshold_px:
@@ -157,17 +183,32 @@ def _residuals_px(problem: _Problem, pose: Pose) -> Float[ndarray, "k"]:
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def _linearise(problem: _Problem, pose: Pose) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 6"]]:
-    """Measured minus projected pixels, and the projection's derivative by (dw, dt): exp([dw]x) R, t + dt."""
-    turned = problem.points_m @ pose.rotation.T
-    projected, derivatives = cv2.projectPoints(
-        turned + pose.translation_m, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
+def _projected(
+    points_m: Float[ndarray, "k 3"], camera: Camera, pose: Pose
+) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 6"]]:
+    """Pixels of points, and their derivative by (dw, dt): exp([dw]x) R, t + dt."""
+    turned = points_m @ pose.rotation.T
+    pixels, derivatives = cv2.projectPoints(
+        turned + pose.translation_m, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion
     )
     by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
     x, y, z = turned.T[:, :, None]
     a, b, c = by_point.transpose(2, 0, 1)
     by_turn = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=2)  # a . (dw x p) = dw . (p x a)
-    return problem.pixels - projected[:, 0], np.concatenate([by_turn, by_point], axis=2)
+    return pixels[:, 0], np.concatenate([by_turn, by_point], axis=2)
+
+
+def _edge_errors(edges: _Edges, camera: Camera, pose: Pose) -> tuple[Float[ndarray, "4"], Float[ndarray, "4 6"]]:
+    """Measured minus projected edges in their sigmas, and the derivative of the latter; zeros where one tells nothing.
+
+    An edge is where the outermost point is.
+    """
+    if (pose.transform(edges.points_m)[:, 2] <= 0).any():
+        return np.zeros(4), np.zeros((4, 6))
+    pixels, derivative = _projected(edges.points_m, camera, pose)
+    outermost, axis = np.concatenate([pixels.argmin(axis=0), pixels.argmax(axis=0)]), np.array([0, 1, 0, 1])
+    per_px = edges.inside / edges.sigma_px
+    return (edges.at_px - pixels[outermost, axis]) * per_px, derivative[outermost, axis] * per_px[:, None]
 
 
 def _moved(pose: Pose, step: Float[ndarray, "6"]) -> Pose:
@@ -175,62 +216,71 @@ def _moved(pose: Pose, step: Float[ndarray, "6"]) -> Pose:
     return Pose(turn @ pose.rotation, pose.translation_m + step[3:])
 
 
+Weigh = Callable[[Float[ndarray, "*k"]], Float[ndarray, "*k"]]
+"""Squared error in units of ROBUST_SIGMAS -> weight."""
+
+
+def _cauchy(ratio: Float[ndarray, "*k"]) -> Float[ndarray, "*k"]:
+    return 1 / (1 + ratio)
+
+
+def _capped(ratio: Float[ndarray, "*k"]) -> Float[ndarray, "*k"]:
+    """What is off by more than ROBUST_SIGMAS of its sigmas is held for so unsure that it is off by just that many."""
+    return np.minimum(1.0, 1 / np.maximum(ratio, 1e-12))
+
+
+def _system(
+    problem: _Problem, pose: Pose, use: Bool[ndarray, "k"], weigh: Weigh
+) -> tuple[float, Float[ndarray, "6 6"], Float[ndarray, "6"]]:
+    """Cauchy's cost, the normal matrix and the gradient of the whitened errors of keypoints in `use` and of edges."""
+    pixels, derivative = _projected(problem.points_m, problem.camera, pose)
+    residual = problem.pixels - pixels
+    ratio = np.einsum("ki,kij,kj->k", residual, problem.information, residual) / ROBUST_SIGMAS**2
+    weight = np.where(use, weigh(ratio), 0.0)
+    weighted = derivative.transpose(0, 2, 1) @ (problem.information * weight[:, None, None])
+    cost, normal = np.log1p(ratio[use]).sum(), (weighted @ derivative).sum(axis=0)
+    gradient = (weighted @ residual[..., None]).sum(axis=0)[:, 0]
+    if problem.edges is not None:
+        error, by_pose = _edge_errors(problem.edges, problem.camera, pose)
+        ratio = error**2 / ROBUST_SIGMAS**2
+        weighted = by_pose.T * weigh(ratio)
+        cost, normal, gradient = cost + np.log1p(ratio).sum(), normal + weighted @ by_pose, gradient + weighted @ error
+    return float(cost), normal, gradient
+
+
 def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
-    """Levenberg-Marquardt on Cauchy's loss of the whitened errors of the keypoints in `use`."""
-    residual, jacobian = _linearise(problem, pose)
-    cost, weight = _cauchy(residual, problem.information, use)
+    """Levenberg-Marquardt on Cauchy's loss."""
+    cost, normal, gradient = _system(problem, pose, use, _cauchy)
     damping = 1e-4
     for _ in range(ITERATIONS):
-        weighted = jacobian.transpose(0, 2, 1) @ (problem.information * weight[:, None, None])
-        normal = (weighted @ jacobian).sum(axis=0)
-        gradient = (weighted @ residual[..., None]).sum(axis=0)[:, 0]
         scale = np.sqrt(np.diag(normal)) + 1e-12
         damped = normal / np.outer(scale, scale) + damping * np.eye(6)
-        step = np.linalg.solve(damped, gradient / scale) / scale
-        trial = _moved(pose, step)
+        trial = _moved(pose, np.linalg.solve(damped, gradient / scale) / scale)
         if (trial.transform(problem.points_m)[use, 2] <= 0).any():
             damping *= 10
             continue
-        trial_residual, trial_jacobian = _linearise(problem, trial)
-        trial_cost, trial_weight = _cauchy(trial_residual, problem.information, use)
+        trial_cost, trial_normal, trial_gradient = _system(problem, trial, use, _cauchy)
         if trial_cost > cost:
             damping *= 10
             continue
         settled = cost - trial_cost < 1e-7 * max(cost, 1e-12)
-        pose, residual, jacobian, cost, weight = trial, trial_residual, trial_jacobian, trial_cost, trial_weight
+        pose, cost, normal, gradient = trial, trial_cost, trial_normal, trial_gradient
         damping *= 0.1
         if settled:
             break
     return pose
 
 
-def _mahalanobis2(residual: Float[ndarray, "k 2"], information: Float[ndarray, "k 2 2"]) -> Float[ndarray, "k"]:
-    return np.einsum("ki,kij,kj->k", residual, information, residual)
-
-
-def _cauchy(
-    residual: Float[ndarray, "k 2"], information: Float[ndarray, "k 2 2"], use: Bool[ndarray, "k"]
-) -> tuple[float, Float[ndarray, "k"]]:
-    """Cost and weights of Cauchy's loss; keypoints outside `use` count nothing."""
-    ratio = _mahalanobis2(residual, information) / ROBUST_SIGMAS**2
-    return float(np.log1p(ratio[use]).sum()), np.where(use, 1 / (1 + ratio), 0.0)
-
-
 def _covariance(problem: _Problem, pose: Pose, inliers: Bool[ndarray, "k"]) -> Float[ndarray, "6 6"] | None:
-    """(J^T W J)^-1 of the inliers, or None when it has no inverse.
-
-    A keypoint off by more than ROBUST_SIGMAS of its sigmas has W scaled down until it is off by just that many.
-    """
-    residual, jacobian = _linearise(problem, pose)
-    off = _mahalanobis2(residual, problem.information)
-    weight = np.where(inliers, np.minimum(1.0, ROBUST_SIGMAS**2 / np.maximum(off, 1e-12)), 0.0)
-    information = problem.information * weight[:, None, None]
-    normal = (jacobian.transpose(0, 2, 1) @ information @ jacobian).sum(axis=0)
-    scale = np.sqrt(np.diag(normal))
-    if not (np.isfinite(scale).all() and (scale > 0).all()):
-        return None
-    unit = normal / np.outer(scale, scale)
-    if np.linalg.cond(unit) > 1e12:
-        return None
+    """(J^T W J)^-1 of the inliers and the edges, or None when the inliers alone have no inverse."""
+    alone = replace(problem, edges=None)
+    for each in (alone, problem):
+        _, normal, _ = _system(each, pose, inliers, _capped)
+        scale = np.sqrt(np.diag(normal))
+        if not (np.isfinite(scale).all() and (scale > 0).all()):
+            return None
+        unit = normal / np.outer(scale, scale)
+        if np.linalg.cond(unit) > 1e12:
+            return None
     covariance = np.linalg.inv(unit) / np.outer(scale, scale)
     return (covariance + covariance.T) / 2
