@@ -23,6 +23,7 @@ import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -234,14 +235,13 @@ def ship(work: Path, out: Path) -> None:
 
 
 def judge(work: Path, models: Path, results: Path) -> None:
-    """The test sequences of both recipes, oracle crop and detected crop; the repository keeps the figures alone."""
-    for name in NAMES:
-        for data in ("frames", "hard"):
-            pages = work / "evaluation" / f"{name}_{data}"
-            evaluate(work / data, model=models / name, split="test", out=pages)
-            kept = results / f"{name}_{'skd' if data == 'frames' else 'skd-hard'}.json"
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(pages / "metrics.json", kept)
+    """The test sequences of both recipes, each crop seen once and in four orientations; the repository keeps the
+    figures alone."""
+    results.mkdir(parents=True, exist_ok=True)
+    for name, (data, recipe), turns in product(NAMES, (("frames", "skd"), ("hard", "skd-hard")), (1, 4)):
+        pages = work / "evaluation" / f"{name}_{data}_{turns}"
+        evaluate(work / data, model=models / name, split="test", out=pages, turns=turns)
+        shutil.copyfile(pages / "metrics.json", results / f"{name}_{recipe}{'_turns4' if turns == 4 else ''}.json")
 
 
 def main() -> None:

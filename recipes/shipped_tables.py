@@ -21,7 +21,12 @@ from gknet.errors import GknetError, ends_in_one_line
 from gknet.fleet import NAMES
 from gknet.onnx_network import METADATA_KEY
 
-PROTOCOLS = {"oracle": "oracle crop", "detected": "detected crop"}
+PROTOCOLS = {
+    "oracle crop": ("oracle", ""),
+    "detected crop": ("detected", ""),
+    "detected crop, 4 turns": ("detected", "_turns4"),
+}
+"""Column -> the run's name in a file of figures, and the end of the file's name."""
 COLUMNS = {
     "rmse_px": "RMSE px",
     "rmse_hidden_px": "RMSE hidden px",
@@ -33,11 +38,12 @@ COLUMNS = {
 }
 
 
-def figures(results: Path, name: str, recipe: str) -> dict[str, Any]:
-    """The runs of a spacecraft's metrics.json, by crop."""
-    path = results / f"{name}_{recipe}.json"
+def figures(results: Path, name: str, recipe: str, words: str = "oracle crop") -> dict[str, Any]:
+    """A run of a spacecraft's metrics.json."""
+    protocol, ending = PROTOCOLS[words]
+    path = results / f"{name}_{recipe}{ending}.json"
     try:
-        return json.loads(path.read_text(encoding="utf-8"))["runs"]
+        return json.loads(path.read_text(encoding="utf-8"))["runs"][protocol]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise GknetError(f"{path}: not the figures of recipes/shipped_models.py ({error})") from error
 
@@ -60,10 +66,9 @@ def table(results: Path, recipe: str) -> str:
         "|---" * (len(shown) + 5) + "|",
     ]
     for name in NAMES:
-        runs = figures(results, name, recipe)
-        for protocol, words in PROTOCOLS.items():
-            run = runs[protocol]
-            located = "" if protocol == "oracle" else f"{100 * run['located_07']:.1f} %"
+        for words in PROTOCOLS:
+            run = figures(results, name, recipe, words)
+            located = "" if words == "oracle crop" else f"{100 * run['located_07']:.1f} %"
             pairs = [(run["metrics"][column]["mean"], run["metrics"][column]["median"]) for column in shown]
             cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
             cells += [f"{mean:.3g}, {median:.3g}" for mean, median in pairs]
@@ -78,7 +83,7 @@ def background_table(results: Path, recipe: str) -> str:
         "|---" * 3 + "|",
     ]
     for name in NAMES:
-        bins = {b["low"] > 0: b for b in figures(results, name, recipe)["oracle"]["bins"] if b["by"] == "earth_in_view"}
+        bins = {b["low"] > 0: b for b in figures(results, name, recipe)["bins"] if b["by"] == "earth_in_view"}
         cells = [name]
         for earth in (False, True):
             rmse = bins[earth]["metrics"]["rmse_px"] if earth in bins else None
@@ -113,13 +118,13 @@ def card(models: Path, results: Path, name: str) -> str:
         size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
         lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
     for recipe in ("skd", "skd-hard"):
-        runs = figures(results, name, recipe)
+        runs = [figures(results, name, recipe, words) for words in PROTOCOLS]
         lines += ["", f"## {recipe}, test sequences: mean [95 % interval over sequences], median", ""]
-        lines += ["| | " + " | ".join(PROTOCOLS.values()) + " |", "|---" * 3 + "|"]
+        lines += ["| | " + " | ".join(PROTOCOLS) + " |", "|---" * (1 + len(PROTOCOLS)) + "|"]
         for column, words in COLUMNS.items():
-            cells = [statistic(runs[protocol], column) for protocol in PROTOCOLS]
+            cells = [statistic(run, column) for run in runs]
             lines.append(f"| {words} | " + " | ".join(cells) + " |")
-        covered = [f"{100 * runs[protocol]['coverage_95']:.0f} %" for protocol in PROTOCOLS]
+        covered = [f"{100 * run['coverage_95']:.0f} %" for run in runs]
         lines.append("| true poses in the 95 % ellipsoid | " + " | ".join(covered) + " |")
     lines += [
         "",

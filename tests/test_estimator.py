@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gknet.estimator as estimating
+from gknet.crop import Crop
 from gknet.decode import Decoding
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, load_estimator, shipped_models
@@ -114,6 +115,47 @@ def test_image_to_pose(name: str, oracle: bool) -> None:
     assert found.rmse_px < 0.5  # the rounding of 8 bits, magnified where the spacecraft is far
     assert found.locator_iou is not None
     assert found.locator_iou > (0.999 if oracle else 0.9)
+
+
+def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
+    """A dot in the picture, and a higher peak at one cell of every view, which is another place in each of them."""
+    y, x = np.mgrid[:256, :256] + 0.5
+    dot = np.exp(-((x - 170) ** 2 + (y - 80) ** 2) / (2 * 6**2))
+    image = np.repeat((230 * dot).astype(np.uint8)[:, :, None], 3, axis=2)
+    batches = []
+
+    def network(images: np.ndarray) -> np.ndarray:
+        batches.append(len(images))
+        maps = images[:, :1].reshape(len(images), 1, 64, 4, 64, 4).mean(axis=(3, 5))
+        maps[:, :, 5, 7] = 1
+        return np.repeat(maps, 14, axis=1).astype(np.float32)
+
+    for turns, place in ((1, (30, 22)), (2, (170, 80)), (4, (170, 80))):
+        estimator = Estimator(network, CRAFT, looking=Looking(turns=turns))
+        np.testing.assert_allclose(estimator.detect(image, Crop(0, 0, 256, 256)).pixels, [place] * 14, atol=0.2)
+    assert batches == [1, 2, 4]
+
+
+def test_other_orientations_than_quarter_turns_are_refused() -> None:
+    with pytest.raises(GknetError, match="1, 2 or 4"):
+        load_estimator("satellite_01", turns=3)
+
+
+def test_a_box_that_the_keypoints_contradict_has_no_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, frame = perfect(POSES["middle"])
+    true_solve, boxes = estimating.solve_pnp, []
+
+    def solve(*arguments: object) -> PnpResult:
+        boxes.append(arguments[5])
+        return true_solve(*arguments)
+
+    monkeypatch.setattr(estimating, "solve_pnp", solve)
+    good = frame.true_box(POINTS)
+    assert good is not None
+    poor = Box(good.x0 + 0.35 * good.side, good.y0, good.x1 + 0.35 * good.side, good.y1)
+    for box in (good, poor):
+        estimator.estimate(frame.image, CAMERA, box)
+    assert boxes == [good, poor, None]
 
 
 def test_swapped_keypoints_do_not_move_the_pose() -> None:

@@ -8,7 +8,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from gknet.crop import Crop
@@ -42,16 +42,16 @@ class Estimator(CropEstimator):
 
     def estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box) -> Estimate:
         crop = Crop.around(box, self.looking.input_size)
-        first = self._estimate_once(image, camera, box, crop)
+        first = self.pose_of(self.detect(image, crop), camera, box, crop)
         better_crop = self._better_crop(first, camera, crop)
         if better_crop is None:
             return first
-        second = self._estimate_once(image, camera, box, better_crop)
+        second = self.pose_of(self.detect(image, better_crop), camera, box, better_crop, trust_box=False)
         return second if _support(second) >= _support(first) else first
 
     def detect(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> Keypoints:
         """The keypoints seen in a crop, in pixels of the full image."""
-        heatmaps = self.keypoint_network(network_input(image, crop))[0]
+        heatmaps = self._heatmaps(network_input(image, crop))
         if len(heatmaps) != self.spacecraft.keypoint_count:
             raise GknetError(
                 f"keypoint network: expected {self.spacecraft.keypoint_count} heatmaps for {self.spacecraft.name}, "
@@ -60,12 +60,20 @@ class Estimator(CropEstimator):
         keypoints = decode_heatmaps(heatmaps, crop.size / heatmaps.shape[2], self.decoding)
         return keypoints_to_image(keypoints, crop)
 
-    def _estimate_once(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box, crop: Crop) -> Estimate:
-        return self.pose_of(self.detect(image, crop), camera, box, crop)
+    def _heatmaps(self, upright: Float32[ndarray, "1 3 s s"]) -> Float32[ndarray, "n hs ws"]:
+        """The mean over quarter turns of the crop, each turned back: what errs in one of them is outvoted."""
+        turns = range(0, 4, 4 // self.looking.turns)
+        views = np.concatenate([np.rot90(upright, turn, (2, 3)) for turn in turns])
+        seen = self.keypoint_network(views)
+        return np.mean([np.rot90(maps, -turn, (1, 2)) for maps, turn in zip(seen, turns, strict=True)], axis=0)
 
-    def pose_of(self, keypoints: Keypoints, camera: Camera, box: Box, crop: Crop) -> Estimate:
-        """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none."""
-        result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp, box)
+    def pose_of(self, keypoints: Keypoints, camera: Camera, box: Box, crop: Crop, trust_box: bool = True) -> Estimate:
+        """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none.
+
+        trust_box   whether the box has a say; not one that the keypoints contradicted
+        """
+        measured = box if trust_box else None
+        result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp, measured)
         if not isinstance(result, PnpResult):
             return Estimate(keypoints, box=box, failure=result)
         contradiction = self.contradiction(result.cam_from_body, camera, crop)
@@ -120,11 +128,11 @@ def shipped_models() -> tuple[str, ...]:
 
 
 def load_estimator(
-    name_or_folder: str | Path, threads: int | None = None, device: str = "cpu"
+    name_or_folder: str | Path, threads: int | None = None, device: str = "cpu", turns: int = 1
 ) -> Estimator | DirectEstimator:
     """An estimator from a shipped model's name, or from a folder with keypoints.onnx or direct.onnx.
 
-    Where a locator.onnx is beside it, the estimator needs no box.
+    Where a locator.onnx is beside it, the estimator needs no box. `turns` is `Looking.turns`.
     """
     folder = Path(name_or_folder)
     if str(name_or_folder) in shipped_models():
@@ -141,8 +149,11 @@ def load_estimator(
     has_locator = (folder / "locator.onnx").is_file()
     locator = _open(folder, "locator", threads, device) if has_locator else None
     about = network.metadata
-    looking = Looking(about.input_size, locator.metadata.input_size if locator else Looking.locator_size)
+    locator_size = locator.metadata.input_size if locator else Looking.locator_size
+    looking = Looking(about.input_size, locator_size, turns=turns)
     if about.bins is not None:
+        if turns > 1:
+            raise GknetError(f"turns: only a keypoint network sees a crop in several orientations, got {turns}")
         return DirectEstimator(network, network.spacecraft, AttitudeBins(about.bins), locator, looking)
     return Estimator(
         network,

@@ -34,6 +34,7 @@ class Looking:
     relook_below   a first box smaller than this part of the locator's view is located again in a crop about it
     refine_crop    look once more where the keypoints say that the crop was off ...
     refine_iou     ... which is when the two crops overlap less than this
+    turns          orientations, of 1, 2 or 4, in which a keypoint network sees the crop; it believes their mean
     """
 
     input_size: int = 256
@@ -42,6 +43,11 @@ class Looking:
     relook_below: float = 0.0
     refine_crop: bool = True
     refine_iou: float = 0.75
+    turns: int = 1
+
+    def __post_init__(self) -> None:
+        if self.turns not in (1, 2, 4):
+            raise GknetError(f"turns: expected 1, 2 or 4 orientations, got {self.turns}")
 
 
 def check_image(image: object) -> UInt8[ndarray, "h w 3"]:

@@ -113,12 +113,14 @@ def solve_pnp(
         keypoints.pixels[usable], np.linalg.inv(keypoints.covariance_px2[usable]), points_m[usable], camera, edges
     )
     result: PnpResult | str = "no keypoint threshold was tried"
-    for threshold in settings.threshold_px:
-        result = _solve(problem, keypoints.score[usable], threshold * input_px, input_px, settings)
-        if isinstance(result, PnpResult):
-            inliers = np.zeros(len(usable), dtype=bool)
-            inliers[usable] = result.inliers
-            return PnpResult(result.cam_from_body, result.covariance, inliers, result.reprojection_rms_px)
+    alone = replace(problem, edges=None)  # a wrong box must not cost the pose
+    for each in (alone,) if box is None else (problem, alone):
+        for threshold in settings.threshold_px:
+            result = _solve(each, keypoints.score[usable], threshold * input_px, input_px, settings)
+            if isinstance(result, PnpResult):
+                inliers = np.zeros(len(usable), dtype=bool)
+                inliers[usable] = result.inliers
+                return PnpResult(result.cam_from_body, result.covariance, inliers, result.reprojection_rms_px)
     return result
 
 

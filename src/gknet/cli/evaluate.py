@@ -25,6 +25,7 @@ def evaluate(
     out: Annotated[Path, typer.Option(help="Folder for metrics.json and report.html.")] = Path("evaluation"),
     pictures: Annotated[int, typer.Option(help="Pictures in each gallery of the report.")] = 6,
     threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
+    turns: Annotated[int, typer.Option(help="Look at each crop in 1, 2 or 4 orientations: surer, slower.")] = 1,
 ) -> None:
     """Score a model on a dataset with true poses: metrics.json and a report."""
     from rich.console import Console
@@ -33,7 +34,7 @@ def evaluate(
     from gknet.report.table import metric_table
     from gknet.source import open_dataset
 
-    estimator = choose_estimator(spacecraft, model, threads)
+    estimator = choose_estimator(spacecraft, model, threads, turns)
     dataset = open_dataset(data, estimator.spacecraft, None if split == "all" else split, every)
     words = f"{data.resolve().name}, split {split}" + (f", every {every}th frame" if every > 1 else "")
     section = evaluate_section(dataset, estimator, words, pictures)

@@ -43,6 +43,7 @@ def predict(
     overlay: Annotated[bool, typer.Option("--overlay/--no-overlay", help="Write overlay pictures.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Write an overlay video.")] = False,
     threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
+    turns: Annotated[int, typer.Option(help="Look at each crop in 1, 2 or 4 orientations: surer, slower.")] = 1,
 ) -> None:
     """Estimate the pose of a spacecraft in pictures."""
     from gknet.prediction import STILLS_FPS, PredictionFiles
@@ -51,7 +52,7 @@ def predict(
     given_box = parse_box(box)
     if given_box is not None and oracle:
         raise GknetError("--box and --oracle: give one of the two")
-    estimator = choose_estimator(spacecraft, model, threads)
+    estimator = choose_estimator(spacecraft, model, threads, turns)
     source = open_source(input_path, choose_lens(camera, focal_px, hfov_deg), estimator.spacecraft, split, every)
     fps = (source.fps or STILLS_FPS) if video else None
     with PredictionFiles(out, estimator.spacecraft, layout.value, overlay, fps) as files:
@@ -87,7 +88,7 @@ def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | N
     return FieldOfView(focal_px, None if hfov_deg is None else radians(hfov_deg))
 
 
-def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | None) -> CropEstimator:
+def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | None, turns: int = 1) -> CropEstimator:
     """The shipped model of a spacecraft, or a user's folder."""
     from gknet.estimator import load_estimator
 
@@ -95,7 +96,7 @@ def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | 
         raise GknetError("give either --spacecraft NAME (a shipped model) or --model FOLDER")
     if threads is not None and threads < 1:
         raise GknetError(f"--threads: expected 1 or more, got {threads}")
-    return load_estimator(model or spacecraft or "", threads=threads)
+    return load_estimator(model or spacecraft or "", threads=threads, turns=turns)
 
 
 def predict_all(
