@@ -22,7 +22,7 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[ToyEstimator], None]:
     monkeypatch.setenv("GKNET_DEBUG", "1")
 
     def put(estimator: ToyEstimator) -> None:
-        monkeypatch.setattr("gknet.estimator.load_estimator", lambda name, threads=None, device="cpu": estimator)
+        monkeypatch.setattr("gknet.estimator.load_estimator", lambda name, **options: estimator)
 
     return put
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from gknet.cli.main import run
+from gknet.cli.predict import choose_estimator
 from gknet.dataset.skd import SkdDataset
 from gknet.frame import Box
 from gknet.image import read_image, write_image
@@ -266,6 +267,14 @@ def test_video_without_frames(use: Use, refused: Refused, tmp_path: Path) -> Non
     path = tmp_path / "hollow.avi"
     cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5, (64, 64)).release()
     assert "video" in refused("predict", path, *MODEL, *LENS, "--out", tmp_path / "out")
+
+
+def test_turns_reach_the_estimator(refused: Refused, pictures: Path, tmp_path: Path) -> None:
+    assert choose_estimator("satellite_01", None, 1, 4).looking.turns == 4
+    shipped = ("--spacecraft", "satellite_01", *LENS)
+    line = refused("predict", pictures / "a.jpg", *shipped, "--turns", "3", "--out", tmp_path / "out")
+    assert "1, 2 or 4" in line
+    assert "got 3" in line
 
 
 def test_unknown_spacecraft(refused: Refused, pictures: Path, tmp_path: Path) -> None:
