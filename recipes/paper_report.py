@@ -153,7 +153,7 @@ def cost_table(costs: dict[str, list[dict]]) -> str:
             [
                 name,
                 f"{one['parameters'] / 1e6:.2f} M",
-                f"{one['gmac']:.2f}",
+                f"{one['gmac']:.3f}",
                 f"{np.median([content['ms'] for content in found]):.1f}",
                 f"{one['learning_rate']:g}",
                 str(one["samples"]),
