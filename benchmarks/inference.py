@@ -28,7 +28,7 @@ from gknet.decode import decode_heatmaps
 from gknet.direct import DirectEstimator, decode_output
 from gknet.errors import ends_in_one_line
 from gknet.estimator import Estimator, load_estimator
-from gknet.frame import Keypoints
+from gknet.frame import Box, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.locate import network_input
 from gknet.pnp import solve_pnp
@@ -70,12 +70,13 @@ def keypoint_stages(estimator: Estimator, given: ndarray, crop: Crop, runs: int)
     pixels = true_px + np.random.default_rng(1).normal(size=true_px.shape)
     count = craft.keypoint_count
     keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
+    box = Box.around(true_px)
     heatmaps = estimator.keypoint_network(given)[0]
     stride = crop.size / heatmaps.shape[2]
     return {
         "keypoint network": median_ms(lambda: estimator.keypoint_network(given), runs),
         "decode": median_ms(lambda: decode_heatmaps(heatmaps, stride), runs),
-        "pose": median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m), runs),
+        "pose": median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m, box=box), runs),
     }
 
 

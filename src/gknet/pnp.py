@@ -276,7 +276,7 @@ def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
 def _covariance(problem: _Problem, pose: Pose, inliers: Bool[ndarray, "k"]) -> Float[ndarray, "6 6"] | None:
     """(J^T W J)^-1 of the inliers and the edges, or None when the inliers alone have no inverse."""
     alone = replace(problem, edges=None)
-    for each in (alone, problem):
+    for each in (alone,) if problem.edges is None else (alone, problem):
         _, normal, _ = _system(each, pose, inliers, _capped)
         scale = np.sqrt(np.diag(normal))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
