@@ -44,6 +44,9 @@ DIRECT = "DMANet"
 """It detects no keypoints: it is in table 2 alone, as in the paper."""
 GRAPHS = ("GKNet", "GKNet, no edges", "GKNet, random edges", "GKNet, no graph branch")
 
+COSTS = ("parameters", "gmac", "ms", "learning_rate", "samples", "minutes", "curve")
+"""What a result tells of its training, beside its trials."""
+
 Trials = dict[tuple[str, str, str], list[Trial]]
 """(name, spacecraft, protocol) -> one for each seed"""
 
@@ -58,6 +61,9 @@ def read(folder: Path) -> tuple[Trials, dict[str, list[dict]]]:
             for protocol, values in content.pop("protocols").items():
                 trial = Trial.from_dict(values)
                 trials[content["name"], trial.spacecraft, protocol].append(trial)
+            missing = [key for key in COSTS if key not in content]
+            if missing:
+                raise GknetError(f"no {', '.join(missing)}")
             costs[content["name"]].append(content | {"spacecraft": trial.spacecraft})
         except (OSError, ValueError, LookupError, TypeError, AttributeError, GknetError) as error:
             raise GknetError(f"{path}: not a result of recipes/paper_tables.py ({error}); delete it") from error

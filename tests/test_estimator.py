@@ -186,6 +186,13 @@ def test_a_poor_box_is_mended_by_the_second_look() -> None:
     assert first.keypoints.score.min() < 0.9
 
 
+def test_a_box_far_larger_than_the_image_is_cut_to_it() -> None:
+    estimator, frame = perfect(POSES["close"])
+    estimate = estimator.estimate(frame.image, CAMERA, Box(-1e9, -1e9, 1e9, 1e9))
+    assert estimate.box == Box(0.0, 0.0, float(CAMERA.width), float(CAMERA.height))
+    assert estimate.failure is None
+
+
 def test_a_good_box_needs_one_look() -> None:
     estimator, frame = perfect(POSES["middle"])
     estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))

@@ -93,9 +93,10 @@ class CropEstimator(ABC):
         box = box or self.locate(image)
         if box is None:
             return Estimate(failure="the locator sees no spacecraft")
-        if box.clipped(camera.width, camera.height) is None:
+        inside = box.clipped(camera.width, camera.height)
+        if inside is None:
             return Estimate(box=box, failure="the box lies outside the image")
-        return self.estimate_in(image, camera, box)
+        return self.estimate_in(image, camera, inside)
 
     def locate(self, image: UInt8[ndarray, "h w *c"]) -> Box | None:
         """The spacecraft's box in pixels of the full image, None when the locator sees none."""

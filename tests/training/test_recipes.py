@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 import subprocess
 import sys
@@ -32,6 +33,19 @@ def test_a_result_that_is_none(content: str, tmp_path: Path) -> None:
     assert "satellite_01_a_0.json: not a result" in said
     assert said.count("\n") == 1
     assert not (tmp_path / "cpu" / "README.md").exists()
+
+
+def test_a_result_without_its_curve(tmp_path: Path) -> None:
+    """As results were before they told how the training went."""
+    kept = next((RECIPES.parent / "results" / "paper_tables" / "cpu").glob("satellite_*.json"))
+    content = json.loads(kept.read_text(encoding="utf-8"))
+    del content["curve"]
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "cpu" / kept.name).write_text(json.dumps(content))
+    said = refused("paper_report.py", "--results", tmp_path)
+    assert f"{kept.name}: not a result" in said
+    assert "no curve" in said
+    assert said.count("\n") == 1
 
 
 def test_a_score_that_is_none(tmp_path: Path) -> None:
