@@ -59,10 +59,14 @@ def stages(estimator: Estimator | DirectEstimator, runs: int) -> dict[str, float
         found["locate (whole frame)"] = median_ms(lambda: estimator.locate(image), runs)
         whole += found["locate (whole frame)"]
     found["frame to pose"] = whole
+    if isinstance(estimator, Estimator):
+        found["pose without the box's say"] = keypoint_stages(estimator, given, crop, runs, False)["pose"]
     return found
 
 
-def keypoint_stages(estimator: Estimator, given: ndarray, crop: Crop, runs: int) -> dict[str, float]:
+def keypoint_stages(
+    estimator: Estimator, given: ndarray, crop: Crop, runs: int, trust_box: bool = True
+) -> dict[str, float]:
     """From the crop to a pose by keypoints."""
     craft = estimator.spacecraft
     pose = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0, 0, 4 * craft.diameter_m])
@@ -70,11 +74,12 @@ def keypoint_stages(estimator: Estimator, given: ndarray, crop: Crop, runs: int)
     pixels = true_px + np.random.default_rng(1).normal(size=true_px.shape)
     count = craft.keypoint_count
     keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
-    box = Box.around(true_px)
+    box = Box.around(true_px) if trust_box else None
+    views = np.repeat(given, estimator.looking.turns, axis=0)
     heatmaps = estimator.keypoint_network(given)[0]
     stride = crop.size / heatmaps.shape[2]
     return {
-        "keypoint network": median_ms(lambda: estimator.keypoint_network(given), runs),
+        "keypoint network": median_ms(lambda: estimator.keypoint_network(views), runs),
         "decode": median_ms(lambda: decode_heatmaps(heatmaps, stride), runs),
         "pose": median_ms(lambda: solve_pnp(keypoints, CAMERA, craft.points_m, box=box), runs),
     }
@@ -116,6 +121,7 @@ def main() -> None:
     parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx or direct.onnx")
     parser.add_argument("--paper", action="store_true", help="time gknet-paper too, the unit of the ratios")
     parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--turns", type=int, default=1, help="orientations in which a crop is seen: 1, 2 or 4")
     chosen = parser.parse_args()
 
     table = Table("stage", "threads", "ms", "of gknet-paper", title=f"inference, {chosen.model}")
@@ -127,7 +133,7 @@ def main() -> None:
             paper_times = {threads: paper_ms(path, threads, chosen.runs) for threads in (1, 2)}
     for threads in (1, 2):
         paper = paper_times.get(threads)
-        for stage, ms in stages(load_estimator(chosen.model, threads), chosen.runs).items():
+        for stage, ms in stages(load_estimator(chosen.model, threads, turns=chosen.turns), chosen.runs).items():
             table.add_row(stage, str(threads), f"{ms:.2f}", f"1/{paper / ms:.0f}" if paper else "-")
         if paper:
             table.add_row("gknet-paper's network", str(threads), f"{paper:.0f}", "1")
