@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import poselib
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from gknet.errors import GknetError
@@ -68,24 +68,28 @@ class _Edges:
     at_px: Float[ndarray, "4"]
     inside: Bool[ndarray, "4"]
     sigma_px: float
-    points_m: Float[ndarray, "n 3"]
 
     @staticmethod
-    def of(box: Box, camera: Camera, points_m: Float[ndarray, "n 3"], sigma: float) -> _Edges:
+    def of(box: Box, camera: Camera, sigma: float) -> _Edges:
         at = np.array([box.x0, box.y0, box.x1, box.y1])
         inside = np.array([box.x0 > 1, box.y0 > 1, box.x1 < camera.width - 1, box.y1 < camera.height - 1])
-        return _Edges(at, inside, sigma * box.side, points_m)
+        return _Edges(at, inside, sigma * box.side)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The usable keypoints, measured in (possibly distorted) image pixels, and the box about all of them."""
+    """The usable keypoints, measured in (possibly distorted) image pixels, and the box about all points."""
 
+    points_m: Float[ndarray, "n 3"]
+    usable: Int[ndarray, "k"]
     pixels: Float[ndarray, "k 2"]
     information: Float[ndarray, "k 2 2"]
-    points_m: Float[ndarray, "k 3"]
     camera: Camera
     edges: _Edges | None
+
+    @property
+    def usable_m(self) -> Float[ndarray, "k 3"]:
+        return self.points_m[self.usable]
 
 
 def solve_pnp(
@@ -108,9 +112,13 @@ def solve_pnp(
     usable = _usable(keypoints, settings.min_score)
     if usable.sum() < 4:
         return f"only {usable.sum()} keypoints are sure enough, a pose needs 4"
-    edges = None if box is None else _Edges.of(box, camera, points_m, settings.box_sigma)
     problem = _Problem(
-        keypoints.pixels[usable], np.linalg.inv(keypoints.covariance_px2[usable]), points_m[usable], camera, edges
+        points_m,
+        np.flatnonzero(usable),
+        keypoints.pixels[usable],
+        np.linalg.inv(keypoints.covariance_px2[usable]),
+        camera,
+        None if box is None else _Edges.of(box, camera, settings.box_sigma),
     )
     result: PnpResult | str = "no keypoint threshold was tried"
     alone = replace(problem, edges=None)  # a wrong box must not cost the pose
@@ -147,7 +155,7 @@ def _solve(
     needed = max(min(settings.min_inliers, len(score)), int(np.ceil(settings.min_inlier_fraction * len(score))))
     if inliers.sum() < needed:
         return f"only {inliers.sum()} of {len(score)} keypoints agree with one pose, expected {needed}"
-    if (pose.transform(problem.points_m)[inliers, 2] <= 0).any():
+    if (pose.transform(problem.usable_m)[inliers, 2] <= 0).any():
         return "the pose puts the spacecraft behind the camera"
     rms = float(np.sqrt((error[inliers] ** 2).mean()))
     if rms > settings.max_rms_px * input_px:
@@ -164,7 +172,7 @@ def _consensus(problem: _Problem, score: Float[ndarray, "k"], threshold_px: floa
     order = np.argsort(-score, kind="stable")
     found, report = poselib.estimate_absolute_pose(
         problem.camera.undistort(problem.pixels)[order],
-        problem.points_m[order],
+        problem.usable_m[order],
         {
             "model": "PINHOLE",
             "width": problem.camera.width,
@@ -181,17 +189,15 @@ def _consensus(problem: _Problem, score: Float[ndarray, "k"], threshold_px: floa
 
 def _residuals_px(problem: _Problem, pose: Pose) -> Float[ndarray, "k"]:
     """Distance from each keypoint to its projection; infinite behind the camera."""
-    distance = np.linalg.norm(problem.camera.project(pose.transform(problem.points_m)) - problem.pixels, axis=1)
+    distance = np.linalg.norm(problem.camera.project(pose.transform(problem.usable_m)) - problem.pixels, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def _projected(
-    points_m: Float[ndarray, "k 3"], camera: Camera, pose: Pose
-) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 6"]]:
-    """Pixels of points, and their derivative by (dw, dt): exp([dw]x) R, t + dt."""
-    turned = points_m @ pose.rotation.T
+def _projected(problem: _Problem, pose: Pose) -> tuple[Float[ndarray, "n 2"], Float[ndarray, "n 2 6"]]:
+    """Pixels of all points, and their derivative by (dw, dt): exp([dw]x) R, t + dt."""
+    turned = problem.points_m @ pose.rotation.T
     pixels, derivatives = cv2.projectPoints(
-        turned + pose.translation_m, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion
+        turned + pose.translation_m, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
     )
     by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
     x, y, z = turned.T[:, :, None]
@@ -200,14 +206,13 @@ def _projected(
     return pixels[:, 0], np.concatenate([by_turn, by_point], axis=2)
 
 
-def _edge_errors(edges: _Edges, camera: Camera, pose: Pose) -> tuple[Float[ndarray, "4"], Float[ndarray, "4 6"]]:
+def _edge_errors(
+    edges: _Edges, pixels: Float[ndarray, "n 2"], derivative: Float[ndarray, "n 2 6"]
+) -> tuple[Float[ndarray, "4"], Float[ndarray, "4 6"]]:
     """Measured minus projected edges in their sigmas, and the derivative of the latter; zeros where one tells nothing.
 
     An edge is where the outermost point is.
     """
-    if (pose.transform(edges.points_m)[:, 2] <= 0).any():
-        return np.zeros(4), np.zeros((4, 6))
-    pixels, derivative = _projected(edges.points_m, camera, pose)
     outermost, axis = np.concatenate([pixels.argmin(axis=0), pixels.argmax(axis=0)]), np.array([0, 1, 0, 1])
     per_px = edges.inside / edges.sigma_px
     return (edges.at_px - pixels[outermost, axis]) * per_px, derivative[outermost, axis] * per_px[:, None]
@@ -235,15 +240,15 @@ def _system(
     problem: _Problem, pose: Pose, use: Bool[ndarray, "k"], weigh: Weigh
 ) -> tuple[float, Float[ndarray, "6 6"], Float[ndarray, "6"]]:
     """Cauchy's cost, the normal matrix and the gradient of the whitened errors of keypoints in `use` and of edges."""
-    pixels, derivative = _projected(problem.points_m, problem.camera, pose)
-    residual = problem.pixels - pixels
-    ratio = np.einsum("ki,kij,kj->k", residual, problem.information, residual) / ROBUST_SIGMAS**2
+    all_pixels, all_derivatives = _projected(problem, pose)
+    derivative, residual = all_derivatives[problem.usable], problem.pixels - all_pixels[problem.usable]
+    ratio = (residual * (problem.information @ residual[..., None])[..., 0]).sum(axis=1) / ROBUST_SIGMAS**2
     weight = np.where(use, weigh(ratio), 0.0)
-    weighted = derivative.transpose(0, 2, 1) @ (problem.information * weight[:, None, None])
-    cost, normal = np.log1p(ratio[use]).sum(), (weighted @ derivative).sum(axis=0)
-    gradient = (weighted @ residual[..., None]).sum(axis=0)[:, 0]
-    if problem.edges is not None:
-        error, by_pose = _edge_errors(problem.edges, problem.camera, pose)
+    weighted = (problem.information @ derivative * weight[:, None, None]).reshape(-1, 6).T
+    cost, normal = np.log1p(ratio[use]).sum(), weighted @ derivative.reshape(-1, 6)
+    gradient = weighted @ residual.ravel()
+    if problem.edges is not None and (pose.transform(problem.points_m)[:, 2] > 0).all():
+        error, by_pose = _edge_errors(problem.edges, all_pixels, all_derivatives)
         ratio = error**2 / ROBUST_SIGMAS**2
         weighted = by_pose.T * weigh(ratio)
         cost, normal, gradient = cost + np.log1p(ratio).sum(), normal + weighted @ by_pose, gradient + weighted @ error
@@ -258,7 +263,7 @@ def _refine(problem: _Problem, pose: Pose, use: Bool[ndarray, "k"]) -> Pose:
         scale = np.sqrt(np.diag(normal)) + 1e-12
         damped = normal / np.outer(scale, scale) + damping * np.eye(6)
         trial = _moved(pose, np.linalg.solve(damped, gradient / scale) / scale)
-        if (trial.transform(problem.points_m)[use, 2] <= 0).any():
+        if (trial.transform(problem.usable_m)[use, 2] <= 0).any():
             damping *= 10
             continue
         trial_cost, trial_normal, trial_gradient = _system(problem, trial, use, _cauchy)
