@@ -8,9 +8,10 @@ Time       45 minutes of rendering, then 75 minutes of training: two runs at a t
            than one run on two threads
 Expected   the table of README.md, printed by recipes/shipped_tables.py from RESULTS
 
---start names the models of the release before, whose weights are trained on. Without it all three spacecraft start
-from a run of 17 minutes on the first one. What ships is the mean of the weights before and after a run, with the share
-that validates best. Every stage keeps what is done: run the command again after an interruption.
+--start names the models of the release before, whose weights are trained on; with --keep-locators its locators ship as
+they are. Without it all three spacecraft start from a run of 17 minutes on the first one. What ships is the mean of the
+weights before and after a run, with the share that validates best, if both are of the same network. Every stage keeps
+what is done: run the command again after an interruption.
 Only train sequences are trained on, val sequences choose the weights and scale the covariances, and test sequences
 serve `judge` alone.
 """
@@ -44,8 +45,9 @@ from gknet.training.settings import TrainSettings, load_run
 from gknet.training.setup import make_task
 from gknet.training.validation import validation_rows
 
+KINDS = ("keypoints", "locator")
 DATA_SEED, TRAINING_SEED = 0, 1
-FIRST_RATE, FURTHER_RATE = 2e-3, 1e-3
+FIRST_RATE, FURTHER_RATE = 4e-3, 2e-3
 """From scratch, and of weights that are trained on: the first rate would undo much of what they know."""
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Of the later weights in the mean with those that a run began with."""
@@ -86,7 +88,7 @@ SCALES = {
         val_every=30,
         test_every=15,
         first_minutes=17,
-        keypoint_minutes=(36, 52, 41),
+        keypoint_minutes=(38, 46, 36),
         locator_minutes=7,
         stages=KEYPOINT_STAGES,
         jobs=2,
@@ -106,15 +108,16 @@ SCALES = {
 }
 
 
-def render(work: Path, scale: Scale) -> None:
-    """Crops to train the keypoints on, small whole pictures for the locator, whole frames to judge by.
+def render(work: Path, scale: Scale, kinds: tuple[str, ...] = KINDS) -> None:
+    """Crops to train the keypoints on, small whole pictures for the locators, whole frames to judge by.
 
     The first 300 sequences of the longer recipe are skd's own, so its train split holds none of skd's val and test.
     """
     longer = RECIPES["skd"].model_copy(update={"sequences": scale.sequences})
     for name in NAMES:
         generate(longer, work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every)
-        generate(longer, work / "pictures", DATA_SEED, name, "train", every=scale.pictures_every, size=256)
+        if "locator" in kinds:
+            generate(longer, work / "pictures", DATA_SEED, name, "train", every=scale.pictures_every, size=256)
         generate("skd", work / "frames", DATA_SEED, name, "val", every=scale.val_every)
         generate("skd", work / "frames", DATA_SEED, name, "test", every=scale.test_every)
         generate("skd-hard", work / "hard", DATA_SEED, name, "test", every=scale.test_every)
@@ -131,7 +134,7 @@ class Job:
     settings: TrainSettings
 
 
-def jobs(work: Path, scale: Scale, start: Path | None) -> list[Job]:
+def jobs(work: Path, scale: Scale, start: Path | None, kinds: tuple[str, ...] = KINDS) -> list[Job]:
     """The keypoint networks, then the locators; from the models in `start`, or from the first run's weights."""
     keypoints: list[Job] = []
     locators: list[Job] = []
@@ -142,7 +145,7 @@ def jobs(work: Path, scale: Scale, start: Path | None) -> list[Job]:
         init = None if start is None else start / name / "locator.safetensors"
         settings = run_settings("locator", scale.locator_minutes, 3, init)
         locators.append(Job(work, "pictures", name, f"{name}_locator", settings))
-    return keypoints + locators
+    return keypoints + (locators if "locator" in kinds else [])
 
 
 def run_settings(
@@ -152,7 +155,6 @@ def run_settings(
         network,
         minutes=minutes,
         stages=stages,
-        optimizer="adamw",  # what ships was trained by it, before decision 0011
         learning_rate=FIRST_RATE if init is None else FURTHER_RATE,
         validations=validations,
         val_frames=200,
@@ -164,18 +166,18 @@ def run_settings(
 def check_start(start: Path | None) -> None:
     """Before hours of rendering, not after them."""
     for name in NAMES if start is not None else ():
-        for kind in ("keypoints", "locator"):
+        for kind in KINDS:
             load_weights(start / name / f"{kind}.safetensors")
 
 
-def train_all(work: Path, scale: Scale, start: Path | None) -> None:
+def train_all(work: Path, scale: Scale, start: Path | None, kinds: tuple[str, ...] = KINDS) -> None:
     """Every network, `scale.jobs` at a time."""
     if start is None:
         run(Job(work, "crops", NAMES[0], FIRST, run_settings("gknet-s", scale.first_minutes, 6, None, FIRST_STAGES)))
     threads = max(1, (os.cpu_count() or 1) // scale.jobs)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(scale.jobs, context, torch.set_num_threads, (threads,)) as pool:
-        for future in as_completed([pool.submit(run_and_blend, job) for job in jobs(work, scale, start)]):
+        for future in as_completed([pool.submit(run_and_blend, job) for job in jobs(work, scale, start, kinds)]):
             print(future.result(), flush=True)
 
 
@@ -205,8 +207,11 @@ def blend(job: Job) -> str:
     record = load_run(trained)
     network = build(record.network, val_data.spacecraft.adjacency, record.graph, record.loss).eval()
     task = make_task(network, val_data.spacecraft, job.settings)
-    after = load_weights(trained / BEST)
-    before = after if job.settings.init is None else load_weights(job.settings.init)
+    before = after = load_weights(trained / BEST)
+    if job.settings.init is not None:
+        before = load_weights(job.settings.init)
+    if shapes(before) != shapes(after):  # of another network, which gave what fitted
+        before = after
     found = {}
     for share in SHARES:
         network.load_state_dict(mean(before, after, share))
@@ -221,6 +226,10 @@ def blend(job: Job) -> str:
     return f"{out}: " + ", ".join(f"share {each} scores {found[each].score:.4g}" for each in found)
 
 
+def shapes(weights: dict[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: tensor.shape for name, tensor in weights.items()}
+
+
 def mean(before: dict[str, Tensor], after: dict[str, Tensor], share: float) -> dict[str, Tensor]:
     """`share` of the later weights; whole numbers are counters and stay."""
     return {
@@ -228,10 +237,15 @@ def mean(before: dict[str, Tensor], after: dict[str, Tensor], share: float) -> d
     }
 
 
-def ship(work: Path, out: Path) -> None:
-    for name in NAMES:
-        for kind in ("keypoints", "locator"):
+def ship(work: Path, out: Path, start: Path | None, kinds: tuple[str, ...] = KINDS) -> None:
+    """Those of `kinds` from their runs, the others from the models in `start`."""
+    for name, kind in product(NAMES, KINDS):
+        if kind in kinds:
             export_run(work / "blended" / f"{name}_{kind}", out / name)
+        else:
+            assert start is not None
+            for suffix in ("onnx", "safetensors"):
+                shutil.copyfile(start / name / f"{kind}.{suffix}", out / name / f"{kind}.{suffix}")
 
 
 def judge(work: Path, models: Path, results: Path) -> None:
@@ -250,15 +264,19 @@ def main() -> None:
         "--work", type=Path, required=True, help="folder of data, caches and runs (30 GB at full scale)"
     )
     parser.add_argument("--start", type=Path, help="folder of the models whose weights are trained on")
+    parser.add_argument("--keep-locators", action="store_true", help="ship those of --start as they are")
     parser.add_argument("--out", type=Path, required=True, help="folder of the exported models")
     parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
     parser.add_argument("--scale", choices=sorted(SCALES), default="cpu")
     arguments = parser.parse_args()
-    scale = SCALES[arguments.scale]
-    check_start(arguments.start)
-    render(arguments.work, scale)
-    train_all(arguments.work, scale, arguments.start)
-    ship(arguments.work, arguments.out)
+    if arguments.keep_locators and arguments.start is None:
+        parser.error("--keep-locators: expected --start beside it, which names the models whose locators ship")
+    scale, start = SCALES[arguments.scale], arguments.start
+    kinds = KINDS[:1] if arguments.keep_locators else KINDS
+    check_start(start)
+    render(arguments.work, scale, kinds)
+    train_all(arguments.work, scale, start, kinds)
+    ship(arguments.work, arguments.out, start, kinds)
     judge(arguments.work, arguments.out, arguments.results)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,16 +165,15 @@ def test_what_a_node_is_told_reaches_its_neighbours_in_the_second_look() -> None
 
 def test_a_network_that_looks_once_takes_no_hints() -> None:
     assert tiny(4).looks_twice
-    for network in (tiny(4, "none"), gknet_s(chain(4))):
-        assert not network.looks_twice
-        assert network.branches(torch.rand(1, 3, 64, 64)).first is None
+    network = tiny(4, "none")
+    assert not network.looks_twice
+    assert network.branches(torch.rand(1, 3, 64, 64)).first is None
 
 
-@pytest.mark.parametrize("glances", [True, False])
-def test_without_edges_no_node_hears_of_another(glances: bool) -> None:
+def test_without_edges_no_node_hears_of_another() -> None:
     """Otherwise the ablation of the edges would not be one of the graph."""
     for graph, heard in (("identity", False), ("skeleton", True)):
-        network = GKNet(replace(tiny(5, graph).config, glances=glances), chain(5)).eval()
+        network = tiny(5, graph).eval()
         torch.nn.init.normal_(network.fusion.join.weight)
         torch.nn.init.normal_(network.node_filter.weight)
         assert network.decoder is not None
@@ -190,13 +188,6 @@ def test_without_edges_no_node_hears_of_another(glances: bool) -> None:
         assert changed[2]
         assert changed[[1, 3]].all() == heard
         assert changed[[0, 1, 3, 4]].any() == heard
-
-
-def test_without_glances_the_decoder_is_the_one_of_equation_2() -> None:
-    network = GKNet(replace(tiny(4).config, glances=False), chain(4))
-    assert network.decoder is not None
-    assert all(isinstance(layer.graph, GraphConvolution) for layer in network.decoder.layers)
-    assert not [name for name in network.state_dict() if "seen" in name]
 
 
 def test_every_picture_of_a_batch_is_mixed_by_the_same_matrix() -> None:

@@ -14,10 +14,12 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("mitsuba")
 
+from gknet.dataset.skd import SkdDataset  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.estimator import load_estimator  # noqa: E402
+from gknet.network.build import build  # noqa: E402
 from gknet.render.recipe import RECIPES  # noqa: E402
-from gknet.training.checkpoint import BEST, load_weights  # noqa: E402
+from gknet.training.checkpoint import BEST, load_weights, save_weights  # noqa: E402
 from gknet.training.schedule import Stage  # noqa: E402
 
 CRAFT = "satellite_01"
@@ -65,7 +67,7 @@ def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
         recipe.SCALES["cpu"], first_minutes=0.05, keypoint_minutes=(0.05,), locator_minutes=0.05, stages=STAGES
     )
     recipe.train_all(work, scale, None)
-    recipe.ship(work, work / "models")
+    recipe.ship(work, work / "models", None)
     assert load_estimator(work / "models" / CRAFT).locator is not None
     assert not list((work / "blended").glob("first*"))
 
@@ -82,6 +84,30 @@ def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
     assert scores is not None
     assert list(scores) == list(recipe.SHARES)
     assert scores[chosen["share"]] == min(scores.values())
+
+
+def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: ModuleType, work: Path) -> None:
+    """And a locator that is kept ships as it was, neither rendered for nor trained."""
+    scale = replace(recipe.SCALES["cpu"], keypoint_minutes=(0.05,), stages=STAGES)
+    start = work / "start"
+    (start / CRAFT).mkdir(parents=True)
+    for suffix in ("onnx", "safetensors"):
+        (start / CRAFT / f"locator.{suffix}").write_bytes(b"as it was")
+    other = {name: weight for name, weight in initial(work).items() if not name.startswith("decoder")}
+    save_weights(start / CRAFT / "keypoints.safetensors", other, {})
+    kinds = ("keypoints",)
+    [job] = recipe.jobs(work, scale, start, kinds)
+    recipe.run(job)
+    assert list(scores_of(recipe.blend(job), recipe) or {}) == [1.0]
+    recipe.ship(work, work / "models", start, kinds)
+    for suffix in ("onnx", "safetensors"):
+        assert (work / "models" / CRAFT / f"locator.{suffix}").read_bytes() == b"as it was"
+    assert (work / "models" / CRAFT / "keypoints.onnx").exists()
+
+
+def initial(work: Path) -> dict[str, torch.Tensor]:
+    spacecraft = SkdDataset(work / "frames", "val", CRAFT).spacecraft
+    return build("gknet-s", spacecraft.adjacency).state_dict()
 
 
 def scores_of(said: str, recipe: ModuleType) -> dict[float, float] | None:

@@ -36,8 +36,6 @@ class GKNetConfig:
     node_width     channels of a graph node and of the image cells that it attends to
     node_layers    layers of the graph decoder
     heads          attention heads
-    glances        whether nodes see, between layers, what is where they believe their keypoints to be (decision 0012),
-                   and look twice (decision 0013)
     graph          "skeleton", "identity" (no edges), "random" (as many edges, anywhere) or "none" (no graph branch)
     """
 
@@ -46,7 +44,6 @@ class GKNetConfig:
     node_width: int = 128
     node_layers: int = 3
     heads: int = 4
-    glances: bool = True
     graph: str = "skeleton"
 
     def __post_init__(self) -> None:
@@ -64,7 +61,7 @@ class GKNet(HeatmapNetwork):
     def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"], loss: str = "likelihood") -> None:
         super().__init__(loss, stride=4)
         self.config = config
-        self.looks_twice = config.glances and config.graph != "none"
+        self.looks_twice = config.graph != "none"
         keypoints = len(adjacency)
         self.encoder = Encoder(config.width)
         widths = self.encoder.widths
@@ -83,7 +80,7 @@ class GKNet(HeatmapNetwork):
         config = self.config
         edges = normalised_adjacency(adjacency, checked_graph(config.graph))
         self.fine_cells = nn.Conv2d(self.encoder.widths[2], config.node_width, 1)
-        glance = config.pyramid_width + POSITION_WIDTH if config.glances else 0
+        glance = config.pyramid_width + POSITION_WIDTH
         self.decoder = GraphDecoder(
             edges, config.node_width, config.node_width, config.heads, config.node_layers, glance
         )
@@ -120,18 +117,17 @@ class GKNet(HeatmapNetwork):
         up: Float[Tensor, "b p h w"],
         pixels: Float[Tensor, "b n h w"],
         hints: Hints | None,
-    ) -> tuple[Float[Tensor, "b n h w"], Float[Tensor, "b n h w"] | None]:
+    ) -> tuple[Float[Tensor, "b n h w"], Float[Tensor, "b n h w"]]:
         """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is.
 
-        In the second look it sees what is where the first one put it, and so do its neighbours by its messages.
+        Between the layers of the decoder it sees what is where it believes its keypoint to be (decision 0012); in the
+        second look, where the first one put it, and so do its neighbours by its messages (decision 0013).
         Returns its map, and what the first look made of both branches.
         """
         assert self.decoder is not None
         code = position_code(up.shape[2], up.shape[3], up)
         along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
         places = functional.relu(self.pixel_features(up) + along)
-        if not self.config.glances:
-            return self._node_maps(self.decoder(memory), places), None
         seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
 
         def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
