@@ -4,7 +4,7 @@
     python recipes/shipped_models.py --work runs/shipped --start src/gknet/models --out models --results results/new
 
 Hardware   2 CPU cores, no GPU
-Time       45 minutes of rendering, then 75 minutes of training: two runs at a time, one thread each, which is faster
+Time       45 minutes of rendering, then 70 minutes of training: two runs at a time, one thread each, which is faster
            than one run on two threads
 Expected   the table of README.md, printed by recipes/shipped_tables.py from RESULTS
 
