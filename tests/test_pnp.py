@@ -240,6 +240,23 @@ def test_an_edge_that_the_image_cuts_tells_nothing() -> None:
     assert not np.array_equal(part.covariance, without.covariance)
 
 
+def test_a_box_tells_nothing_of_a_spacecraft_that_reaches_behind_the_camera() -> None:
+    """What lies behind is projected to a mirrored place, which is no edge."""
+    behind = POSE.inverse().transform(np.array([[2.0, 1.0, -0.5]]))
+    points = np.concatenate([POINTS, behind])
+    clean = seen(POSE, sigma_px=3, points=points)
+    keypoints = Keypoints(
+        np.where(np.arange(17)[:, None] < 16, clean.pixels, 0.0),
+        np.where(np.arange(17) < 16, 0.9, 0.0),
+        clean.covariance_px2,
+    )
+    without, boxed = (solve_pnp(keypoints, CAMERA, points, box=box) for box in (None, box_of(POSE)))
+    assert isinstance(without, PnpResult)
+    assert isinstance(boxed, PnpResult)
+    np.testing.assert_array_equal(boxed.cam_from_body.translation_m, without.cam_from_body.translation_m)
+    np.testing.assert_array_equal(boxed.covariance, without.covariance)
+
+
 def test_covariance_counts_the_box() -> None:
     """Monte-Carlo over noisy keypoints and noisy edges: the NEES is 6 in the mean."""
     generator = np.random.default_rng(4)
