@@ -9,7 +9,7 @@ Time       45 minutes of rendering, then 70 minutes of training: two runs at a t
 Expected   the table of README.md, printed by recipes/shipped_tables.py from RESULTS
 
 --start names the models of the release before, whose weights are trained on; with --keep-locators its locators ship as
-they are. Without it all three spacecraft start from a run of 17 minutes on the first one. What ships is the mean of the
+they are. Without --start all three begin with a run of 17 minutes on the first one. What ships is the mean of the
 weights before and after a run, with the share that validates best, if both are of the same network. Every stage keeps
 what is done: run the command again after an interruption.
 Only train sequences are trained on, val sequences choose the weights and scale the covariances, and test sequences

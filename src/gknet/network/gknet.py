@@ -80,10 +80,8 @@ class GKNet(HeatmapNetwork):
         config = self.config
         edges = normalised_adjacency(adjacency, checked_graph(config.graph))
         self.fine_cells = nn.Conv2d(self.encoder.widths[2], config.node_width, 1)
-        glance = config.pyramid_width + POSITION_WIDTH
-        self.decoder = GraphDecoder(
-            edges, config.node_width, config.node_width, config.heads, config.node_layers, glance
-        )
+        seen = config.pyramid_width + POSITION_WIDTH
+        self.decoder = GraphDecoder(edges, config.node_width, config.node_width, config.heads, config.node_layers, seen)
         self.pixel_position = nn.Linear(POSITION_WIDTH, config.pyramid_width)
         self.pixel_features = ConvNorm(config.pyramid_width, config.pyramid_width, 1, relu=False)
         self.node_filter = nn.Linear(config.node_width, config.pyramid_width + 1)
