@@ -297,3 +297,28 @@ def test_a_wrong_box_never_costs_the_pose() -> None:
         assert result.inliers.sum() > 4
         dragged += np.array_equal(result.covariance, with_box(keypoints, None).covariance)
     assert dragged > 5
+
+
+def test_few_keypoints_at_odds_with_the_box_are_refused() -> None:
+    """A few that are exchanged may agree on half the range or twice; the box knows better."""
+    few, many = seen(POSE), seen(POSE)
+    few.score[7:], many.score[8:] = 0, 0
+    for factor, words in ((0.7, "7 keypoints"), (2.5, "2.5 times")):
+        box = box_of(Pose(POSE.rotation, POSE.translation_m * factor))
+        settings = PnpSettings(max_box_ratio=1.2 if factor < 1 else 2.0)
+        result = solve_pnp(few, CAMERA, POINTS, 1.0, settings, box)
+        assert isinstance(result, str) and words in result, result
+        assert isinstance(solve_pnp(many, CAMERA, POINTS, 1.0, settings, box), PnpResult)
+        assert isinstance(solve_pnp(few, CAMERA, POINTS), PnpResult)
+    assert isinstance(solve_pnp(few, CAMERA, POINTS, box=box_of(POSE)), PnpResult)
+
+
+def test_a_box_that_the_image_cuts_refuses_no_pose() -> None:
+    few = seen(POSE)
+    few.score[7:] = 0
+    assert with_box(few, Box(0.0, 0.0, float(CAMERA.width), 1.0)).inliers.sum() == 7
+
+
+def test_a_ratio_to_the_box_that_refuses_everything_is_an_error() -> None:
+    with pytest.raises(GknetError, match="above 1"):
+        PnpSettings(max_box_ratio=1.0)

@@ -31,6 +31,8 @@ class PnpSettings:
     min_inliers      and at least this fraction of the keypoints used
     max_rms_px       of the inliers' reprojection errors
     box_sigma        standard deviation of an edge of the spacecraft's box, as a share of the box's longer side
+    max_box_ratio    of the pose's extent to the box's along the box's longer side, either way, for a pose that less
+                     than half of the spacecraft's keypoints agree with
     covariance_scale of the pose: keypoints of one picture err alike, more than independent ones; from calibration.py
     """
 
@@ -40,6 +42,7 @@ class PnpSettings:
     min_inlier_fraction: float = 0.3
     max_rms_px: float = 10.0
     box_sigma: float = 0.1
+    max_box_ratio: float = 2.0
     covariance_scale: float = 1.0
 
     def __post_init__(self) -> None:
@@ -47,6 +50,8 @@ class PnpSettings:
             raise GknetError(f"pnp: expected positive thresholds, got {self.threshold_px}")
         if not self.box_sigma > 0:
             raise GknetError(f"pnp: expected a positive sigma of the box, got {self.box_sigma}")
+        if not self.max_box_ratio > 1:
+            raise GknetError(f"pnp: expected a ratio to the box above 1, got {self.max_box_ratio}")
         if not self.covariance_scale > 0:
             raise GknetError(f"pnp: expected a positive covariance scale, got {self.covariance_scale}")
 
@@ -125,11 +130,28 @@ def solve_pnp(
     for each in (alone,) if box is None else (problem, alone):
         for threshold in settings.threshold_px:
             result = _solve(each, keypoints.score[usable], threshold * input_px, input_px, settings)
+            if isinstance(result, PnpResult) and problem.edges is not None:
+                result = _against_box(problem, problem.edges, result, settings.max_box_ratio)
             if isinstance(result, PnpResult):
                 inliers = np.zeros(len(usable), dtype=bool)
                 inliers[usable] = result.inliers
                 return PnpResult(result.cam_from_body, result.covariance, inliers, result.reprojection_rms_px)
     return result
+
+
+def _against_box(problem: _Problem, edges: _Edges, result: PnpResult, max_ratio: float) -> PnpResult | str:
+    """The result, or that so few keypoints are at odds with the box. One whose longer side is cut tells nothing."""
+    if 2 * result.inliers.sum() >= len(problem.points_m):
+        return result
+    low, high = edges.at_px[:2], edges.at_px[2:]
+    axis = int((high - low).argmax())
+    pixels = problem.camera.project(result.cam_from_body.transform(problem.points_m))[:, axis]
+    if not (edges.inside[axis] and edges.inside[axis + 2] and np.isfinite(pixels).all()):
+        return result
+    ratio = np.ptp(pixels) / (high - low)[axis]
+    if 1 / max_ratio <= ratio <= max_ratio:
+        return result
+    return f"{result.inliers.sum()} keypoints make the spacecraft {ratio:.2g} times as large as its box"
 
 
 def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, "n"]:
