@@ -49,7 +49,7 @@ def noise_cache(spacecraft: Spacecraft, count: int = 512, size: int = 320) -> Ca
 def stepper(network_name: str, spacecraft: Spacecraft, averaged: bool) -> Callable[[Batch], None]:
     """One training step on a batch; with averaging and clipping when it is the real loop's."""
     settings = TrainSettings(network_name, epochs=1)
-    network = build(network_name, spacecraft.adjacency).to(memory_format=torch.channels_last)
+    network = build(network_name, spacecraft.adjacency, spacecraft.points_m).to(memory_format=torch.channels_last)
     average = copy.deepcopy(network)
     task, optimizer, device = (
         make_task(network, spacecraft, settings),
@@ -115,7 +115,7 @@ def main() -> None:
             data = SkdDataset(arguments.data, "train", arguments.spacecraft)
             spacecraft = data.spacecraft
             cache = open_cache(data, settings, Path(scratch), print)
-        task = make_task(build("gknet-s", spacecraft.adjacency), spacecraft, settings)
+        task = make_task(build("gknet-s", spacecraft.adjacency, spacecraft.points_m), spacecraft, settings)
         loader = Loader(cache, task.draw, seed=0)
         for size in arguments.size:
             compare("gknet-s", loader, spacecraft, Stage(1.0, size, arguments.batch), arguments.steps)

@@ -308,7 +308,8 @@ def cost(method: Method, network: OnnxNetwork, size: int) -> dict[str, object]:
 
     from gknet.network.build import build
 
-    built = build(method.network, network.spacecraft.adjacency, method.graph).eval()
+    craft = network.spacecraft
+    built = build(method.network, craft.adjacency, craft.points_m, method.graph).eval()
     with FlopCounterMode(display=False) as counter:
         built(torch.zeros(1, 3, size, size))
     image = np.zeros((1, 3, size, size), np.float32)

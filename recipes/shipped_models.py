@@ -205,7 +205,9 @@ def blend(job: Job) -> str:
     val_data = SkdDataset(job.work / "frames", "val", job.name)
     rows = validation_rows(len(val_data), job.settings.val_frames)
     record = load_run(trained)
-    network = build(record.network, val_data.spacecraft.adjacency, record.graph, record.loss).eval()
+    network = build(
+        record.network, val_data.spacecraft.adjacency, val_data.spacecraft.points_m, record.graph, record.loss
+    ).eval()
     task = make_task(network, val_data.spacecraft, job.settings)
     before = after = load_weights(trained / BEST)
     if job.settings.init is not None:

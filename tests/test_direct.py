@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gknet.attitude import AttitudeBins
 from gknet.crop import Crop
-from gknet.direct import AttitudeBins, CropPose, DirectEstimator, decode_output, focal_px, least_turn
+from gknet.direct import CropPose, DirectEstimator, decode_output, focal_px, least_turn
 from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera, Pose
@@ -24,7 +25,6 @@ POINTS = np.random.default_rng(7).uniform(-1, 1, (14, 3)) * (3, 1, 1)
 CRAFT = Spacecraft("probe", tuple(f"k{i}" for i in range(14)), POINTS, ((0, 1),), 6.5)
 CAMERA = Camera.from_focal(1000, 800, 640)
 BINS = AttitudeBins(16)
-HALF_TURN = Pose.from_quaternion([0, 0, 1, 0], np.zeros(3))
 
 
 @st.composite
@@ -123,47 +123,6 @@ def test_a_turned_picture_shows_the_pose_of_a_rolled_camera(
     np.testing.assert_allclose(rolled.project(found.transform(near)), moved, atol=1e-5 * np.abs(moved).max())
 
 
-@given(quaternions())
-def test_the_attitude_of_a_soft_label_is_its_own(quaternion: np.ndarray) -> None:
-    """Everywhere: where an Euler angle wraps, at its poles, and near half turns."""
-    label = BINS.soft_label(quaternion)
-    assert label.shape == (BINS.count,)
-    assert label.sum() == pytest.approx(1)
-    assert label.min() >= 0
-    found = BINS.attitude_wxyz(label)
-    assert Pose.from_quaternion(found, np.zeros(3)).angle_to(Pose.from_quaternion(quaternion, np.zeros(3))) < 1e-3
-
-
-@pytest.mark.parametrize(
-    "angles", [(math.pi, 0.2, -0.4), (0.3, 0.1, math.pi), (0.7, math.pi / 2, 0.2), (1.0, -math.pi / 2, -2.0)]
-)
-def test_labels_wrap_where_angles_do(angles: tuple[float, float, float]) -> None:
-    """A step across an end of an angle, or through a pole, changes a label as little as any other step."""
-    at = Rotation.from_euler("ZYX", angles)
-    step = Rotation.from_rotvec([0.004, -0.006, 0.005])
-    quaternion = [(turn * at).as_quat()[[3, 0, 1, 2]] for turn in (step.inv(), step)]
-    before, after = (BINS.soft_label(each) for each in quaternion)
-    assert np.abs(before - after).sum() < 0.1
-    np.testing.assert_allclose(BINS.soft_label(-quaternion[0]), before)
-
-
-def test_a_label_is_a_gaussian_of_the_angle_over_the_volume_of_rotations() -> None:
-    """Its spread about the attitude is SOFTNESS bins in each direction, poles or not."""
-    for middle in Rotation.random(20, rng=0):
-        label = BINS.soft_label(middle.as_quat()[[3, 0, 1, 2]])
-        centres = Rotation.from_quat(BINS.centres_wxyz[:, [1, 2, 3, 0]])
-        off = (centres * middle.inv()).as_rotvec()
-        spread = np.sqrt(np.linalg.eigvalsh(np.einsum("k,ki,kj->ij", label, off, off)))
-        assert (np.abs(spread / (0.6 * 2 * np.pi / 16) - 1) < 0.25).all()
-
-
-def test_of_two_twins_half_a_turn_apart_the_likelier_is_taken_whole() -> None:
-    one = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], np.zeros(3))
-    twin = one @ HALF_TURN
-    belief = 0.6 * BINS.soft_label(one.quaternion_wxyz) + 0.4 * BINS.soft_label(twin.quaternion_wxyz)
-    assert Pose.from_quaternion(BINS.attitude_wxyz(belief), np.zeros(3)).angle_to(one) < math.radians(2)
-
-
 def output_of(shown: CropPose) -> np.ndarray:
     """What a perfect network says."""
     row = np.concatenate([shown.offset, [shown.log_depth], BINS.soft_label(shown.attitude_wxyz)])
@@ -211,9 +170,6 @@ def test_answers_that_cannot_be_are_failures(place: int, value: float, said: str
 def test_bad_use_is_refused() -> None:
     with pytest.raises(GknetError, match="2051 numbers"):
         decode_output(np.zeros(7, np.float32), BINS)
-    for count in (2, 7):
-        with pytest.raises(GknetError, match="attitude bins"):
-            AttitudeBins(count)
     with pytest.raises(GknetError, match="give a box"):
         DirectEstimator(lambda images: images, CRAFT).estimate(np.zeros((640, 800, 3), np.uint8), CAMERA)
     assert focal_px(CAMERA) == pytest.approx(1000)

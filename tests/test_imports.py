@@ -19,7 +19,7 @@ LAYERS = (
     {"atomic", "geometry", "progress", "torch_file"},
     {"frame", "image", "video"},
     {"crop", "spacecraft"},
-    {"decode", "onnx_network", "pnp"},
+    {"attitude", "decode", "onnx_network", "pnp"},
     {"fleet", "dataset", "locate", "network", "pose_file"},
     {"camera_file", "direct", "metrics"},
     {"estimator"},
@@ -37,7 +37,7 @@ HEAVY = {
     *("mitsuba", "drjit", "trimesh", "manifold3d", "shapely", "mapbox_earcut", "PIL", "mpl_toolkits", "matplotlib"),
 }
 MAY_BE_HEAVY = {"fleet", "render", "network", "training"}
-NETWORK_MAY_KNOW = {"errors"}
+NETWORK_MAY_KNOW = {"attitude", "errors"}
 FACE = "__init__"
 
 

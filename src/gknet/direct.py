@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from gknet.attitude import AttitudeBins, rotation_of, wxyz_of
 from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Keypoints
@@ -28,11 +28,8 @@ from gknet.geometry import Camera, Pose
 from gknet.locate import CropEstimator, Looking, Network, network_input
 from gknet.spacecraft import Spacecraft
 
-SOFTNESS = 0.6
-"""Standard deviation of a soft label in bins. Less, and what lies between two bins is lost; more, and labels blur."""
-
-CORRECTIONS = 4
-"""Steps from the mean of the bins to the attitude whose label has that mean: 0.2 degrees in the mean, then 0.001."""
+SQUARE = 0.01
+"""How far fx / fy may be from 1 where pictures are turned."""
 
 FARTHEST = 10.0
 """A logarithm of the depth beyond this is no answer; it is cut off, and the pose is refused for its size."""
@@ -74,9 +71,9 @@ class CropPose:
         linear = input_from_crop[:2, :2]
         pixel = linear @ ((self.offset + 0.5) * crop_size) + input_from_crop[:2, 2]
         scale, angle = math.sqrt(np.linalg.det(linear)), math.atan2(linear[1, 0], linear[0, 0])
-        roll = Rotation.from_rotvec([0.0, 0.0, angle]) * _rotation(self.attitude_wxyz)
+        roll = Rotation.from_rotvec([0.0, 0.0, angle]) * rotation_of(self.attitude_wxyz)
         log_depth = self.log_depth + math.log(input_size / (scale * crop_size))
-        return CropPose(pixel / input_size - 0.5, log_depth, _wxyz(roll))
+        return CropPose(pixel / input_size - 0.5, log_depth, wxyz_of(roll))
 
     @property
     def vector(self) -> Float[ndarray, "7"]:
@@ -92,78 +89,16 @@ def focal_px(camera: Camera) -> float:
     return math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
 
 
+def has_square_pixels(camera: Camera) -> bool:
+    """Whether a turned picture is one of a rolled camera."""
+    return bool(abs(camera.matrix[0, 0] / camera.matrix[1, 1] - 1) <= SQUARE)
+
+
 def least_turn(ray: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
     """The rotation by the smallest angle that takes the optical axis to a ray in front of the camera."""
     x, y, z = ray / np.linalg.norm(ray)
     cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])  # of the axis (-y, x, 0), by the sine of the angle
     return np.eye(3) + cross + cross @ cross / (1 + z)
-
-
-def _rotation(wxyz: Float[ndarray, "*b 4"]) -> Rotation:
-    return Rotation.from_quat(wxyz[..., [1, 2, 3, 0]])
-
-
-def _wxyz(rotation: Rotation) -> Float[ndarray, "4"]:
-    return rotation.as_quat()[[3, 0, 1, 2]]
-
-
-@dataclass(frozen=True)
-class AttitudeBins:
-    """Soft classes of attitude: the cells of a grid of Euler angles (z, y, x), `per_turn` to a turn of each.
-
-    y goes over half a turn, so there are per_turn^3 / 2 cells. A label weighs each cell by how near its centre is, as a
-    rotation, and by its volume (cos y). Hence angles wrap by themselves, q and -q are one, and the poles, where a cell
-    is narrow and z and x turn about one axis, are no special place: many small cells share what one would have.
-    """
-
-    per_turn: int = 16
-
-    def __post_init__(self) -> None:
-        if self.per_turn < 4 or self.per_turn % 2:
-            raise GknetError(f"attitude bins: expected an even number of 4 or more, got {self.per_turn}")
-
-    @property
-    def count(self) -> int:
-        return self.per_turn**3 // 2
-
-    @cached_property
-    def _angles_rad(self) -> Float[ndarray, "k 3"]:
-        turn = (np.arange(self.per_turn) + 0.5) * 2 * np.pi / self.per_turn
-        half = turn[: self.per_turn // 2] - np.pi / 2
-        return np.stack(np.meshgrid(turn, half, turn, indexing="ij"), axis=-1).reshape(-1, 3)
-
-    @cached_property
-    def centres_wxyz(self) -> Float[ndarray, "k 4"]:
-        return Rotation.from_euler("ZYX", self._angles_rad).as_quat()[:, [3, 0, 1, 2]]
-
-    @cached_property
-    def _moments(self) -> Float[ndarray, "k 16"]:
-        return (self.centres_wxyz[:, :, None] * self.centres_wxyz[:, None, :]).reshape(-1, 16)
-
-    def soft_label(self, attitude_wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b k"]:
-        """The share of each cell, summing to 1: volume times exp(2 (<q, q_cell>^2 - 1) / sigma^2).
-
-        For a small angle a between the two that is a Gaussian, exp(-a^2 / (2 sigma^2)).
-        """
-        sigma = SOFTNESS * 2 * np.pi / self.per_turn
-        nearness = 2 / sigma**2 * ((attitude_wxyz @ self.centres_wxyz.T) ** 2 - 1)
-        label = np.cos(self._angles_rad[:, 1]) * np.exp(nearness)
-        return label / label.sum(axis=-1, keepdims=True)
-
-    def attitude_wxyz(self, belief: Float[ndarray, "k"]) -> Float[ndarray, "4"]:
-        """The expected attitude; of a soft label, the attitude that it was made of.
-
-        The mean of quaternions is the first eigenvector of sum p q q^T (Markley et al. 2007). Attitudes half a turn
-        apart are orthogonal, so the lesser of two such twins does not draw the mean away from the other.
-        """
-        wanted = self._mean(belief)
-        found = wanted
-        for _ in range(CORRECTIONS):
-            found = wanted * self._mean(self.soft_label(_wxyz(found))).inv() * found
-        return _wxyz(found)
-
-    def _mean(self, belief: Float[ndarray, "k"]) -> Rotation:
-        return _rotation(np.linalg.eigh((belief @ self._moments).reshape(4, 4))[1][:, -1])
 
 
 def decode_output(output: Float[ndarray, "c"], bins: AttitudeBins) -> CropPose | None:

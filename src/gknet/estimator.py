@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from gknet.attitude import AttitudeBins
 from gknet.crop import Crop
 from gknet.decode import Decoding, decode_heatmaps, keypoints_to_image
-from gknet.direct import AttitudeBins, DirectEstimator
+from gknet.direct import DirectEstimator
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera

@@ -15,7 +15,7 @@ from gknet.network.build import gknet_s, gknet_xs  # noqa: E402
 from gknet.network.gknet import GKNet  # noqa: E402
 from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, Hints  # noqa: E402
-from tests.network.tiny import chain, tiny  # noqa: E402
+from tests.network.tiny import chain, points, tiny  # noqa: E402
 
 
 def test_adjacency_is_normalised_as_in_equation_3() -> None:
@@ -69,7 +69,7 @@ def test_renumbering_the_keypoints_of_a_network_renumbers_its_channels() -> None
     """Channel k, node k and row k of the adjacency are one keypoint: whoever moves one of them moves them all."""
     order = np.array([3, 0, 4, 1, 2])
     network = tiny(5).eval()
-    other = GKNet(network.config, chain(5)[np.ix_(order, order)]).eval()
+    other = GKNet(network.config, chain(5)[np.ix_(order, order)], points(5)[order]).eval()
     weights = network.state_dict()
     torch.nn.init.normal_(weights["fusion.join.weight"])
     for name in ("pixel_head.weight", "pixel_head.bias", "decoder.queries", "fusion.join.bias"):
@@ -207,7 +207,7 @@ def test_at_the_start_both_branches_reach_the_output_channel_by_channel() -> Non
 
 @pytest.mark.parametrize("make", [gknet_s, gknet_xs])
 def test_at_the_start_the_graph_does_not_drown_the_other_branch(make: Callable[[np.ndarray], GKNet]) -> None:
-    branches = make(chain(16)).branches(torch.rand(2, 3, 128, 128))
+    branches = make(chain(16), points(16)).branches(torch.rand(2, 3, 128, 128))
     assert branches.nodes is not None
     assert branches.fused.abs().max() < 1
     assert branches.nodes.abs().mean() < 0.1

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 
-from gknet.direct import AttitudeBins  # noqa: E402
+from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.network.backbone import position_code  # noqa: E402
 from gknet.network.build import (  # noqa: E402
@@ -35,7 +35,7 @@ from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log
 from gknet.network.hrnet import HRNet, HRNetConfig  # noqa: E402
 from gknet.network.resunet import ResUNet, ResUNetConfig  # noqa: E402
 from gknet.training.loss import gaussian_targets  # noqa: E402
-from tests.network.tiny import chain, tiny  # noqa: E402
+from tests.network.tiny import chain, points, tiny  # noqa: E402
 
 
 def parameters(network: torch.nn.Module) -> int:
@@ -70,7 +70,7 @@ def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
 def test_without_edges_the_size_is_the_same() -> None:
     assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton")) == parameters(tiny(9, "random"))
     for network in (gknet_s, gknet_xs):
-        whole, without = parameters(network(chain(16))), parameters(network(chain(16), "none"))
+        whole, without = (parameters(network(chain(16), points(16), graph)) for graph in ("skeleton", "none"))
         assert abs(without / whole - 1) < 0.03
 
 
@@ -78,12 +78,12 @@ def test_without_edges_the_size_is_the_same() -> None:
 def test_a_named_network_has_the_graph_that_was_asked_for(name: str) -> None:
     skeleton = chain(5)
     for graph in ("skeleton", "identity", "random"):
-        network = build(name, skeleton, graph)
+        network = build(name, skeleton, points(5), graph)
         found = [each for key, each in network.named_buffers() if key.endswith("adjacency")]
         assert found
         for each in found:
             torch.testing.assert_close(each, normalised_adjacency(skeleton, graph))  # type: ignore[arg-type]
-    without = build(name, skeleton, "none")
+    without = build(name, skeleton, points(5), "none")
     assert not [key for key, _ in without.named_buffers() if key.endswith("adjacency")]
 
 
@@ -180,14 +180,14 @@ def multiply_accumulates(network: torch.nn.Module) -> float:
 
 
 def test_the_methods_cost_the_same_to_run() -> None:
-    ours = multiply_accumulates(gknet_xs(chain(16)))
+    ours = multiply_accumulates(gknet_xs(chain(16), points(16)))
     for other in (hrnet_xs(16), resunet_xs(16), dmanet_xs()):
         assert abs(multiply_accumulates(other) / ours - 1) < 0.05
 
 
 def test_named_sizes() -> None:
-    assert 2e6 < parameters(gknet_s(chain(16))) < 3.5e6
-    assert 0.8e6 < parameters(gknet_xs(chain(16))) < 1e6
+    assert 2e6 < parameters(gknet_s(chain(16), points(16))) < 3.5e6
+    assert 0.8e6 < parameters(gknet_xs(chain(16), points(16))) < 1.1e6
     assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
     assert 28e6 < parameters(hrnet(16)) < 30e6
     assert 23e6 < parameters(resunet(16)) < 26e6
@@ -226,10 +226,10 @@ def test_bad_choices_are_named() -> None:
         with pytest.raises(GknetError, match="dmanet"):
             DMANetConfig(**{"width": (4,) * 4, "growth": (4,) * 4, "blocks": (1,) * 4, "head": 4} | sizes)
     with pytest.raises(GknetError, match="loss"):
-        build("gknet-s", chain(5), loss="hinge")
+        build("gknet-s", chain(5), points(5), loss="hinge")
     with pytest.raises(GknetError, match="graph"):
         GKNetConfig(graph="full")
     with pytest.raises(GknetError, match="network"):
-        build("hourglass", chain(5))
+        build("hourglass", chain(5), points(5))
     with pytest.raises(GknetError, match="multiples of 32"):
         tiny(5)(torch.rand(1, 3, 100, 100))

@@ -15,6 +15,12 @@ def chain(count: int) -> np.ndarray:
     return matrix
 
 
-def tiny(count: int, graph: str = "skeleton") -> GKNet:
+def points(count: int) -> np.ndarray:
+    """(count, 3) keypoints in metres, no two alike."""
+    return np.random.default_rng(count).uniform(-1, 1, (count, 3)) * (3, 2, 1)
+
+
+def tiny(count: int, graph: str = "skeleton", bins: int = 4) -> GKNet:
     torch.manual_seed(0)
-    return GKNet(GKNetConfig(width=4, pyramid_width=8, node_width=8, node_layers=2, heads=2, graph=graph), chain(count))
+    config = GKNetConfig(width=4, pyramid_width=8, node_width=8, node_layers=2, heads=2, bins=bins, graph=graph)
+    return GKNet(config, chain(count), points(count))

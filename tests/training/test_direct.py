@@ -14,10 +14,11 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
 import gknet.training.export as exporting  # noqa: E402
+from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.cli.main import run as command  # noqa: E402
 from gknet.crop import Crop  # noqa: E402
 from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.direct import AttitudeBins, CropPose, DirectEstimator, decode_output  # noqa: E402
+from gknet.direct import CropPose, DirectEstimator, decode_output  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.estimator import load_estimator  # noqa: E402
 from gknet.frame import Frame  # noqa: E402
@@ -186,7 +187,7 @@ def test_a_frame_whose_origin_is_behind_the_camera_counts_for_nothing(data: Path
     cache = build_cache(dataset, dataset.spacecraft, data / "cache", 96)
     blind = replace(cache, poses=np.full_like(cache.poses, np.nan))
     batch = Loader(blind, draw_keypoints, 0).batch(0, Stage(1, 64, 4))
-    network = build("dmanet-xs", CRAFT.adjacency)
+    network = build("dmanet-xs", CRAFT.adjacency, CRAFT.points_m)
     loss = make_task(network, CRAFT, SETTINGS).loss(network, batch, torch.device("cpu"))
     assert loss.item() == 0
 
@@ -203,8 +204,8 @@ def test_pixels_that_are_not_square_are_refused_to_a_direct_network_alone() -> N
             return replace(frame, camera=Camera(wide, 512, 512))
 
     with pytest.raises(GknetError, match=r"frame 0: expected square pixels, got fx / fy of 1\.100"):
-        check_cameras(build("dmanet-xs", CRAFT.adjacency), Frames())
-    check_cameras(build("gknet-s", CRAFT.adjacency), Frames())
+        check_cameras(build("dmanet-xs", CRAFT.adjacency, CRAFT.points_m), Frames())
+    check_cameras(build("gknet-s", CRAFT.adjacency, CRAFT.points_m), Frames())
 
 
 def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:

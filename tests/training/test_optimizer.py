@@ -14,6 +14,7 @@ from gknet.training.optimizer import Muon, make_optimizer, orthogonalised  # noq
 from gknet.training.settings import TrainSettings  # noqa: E402
 
 CHAIN = np.eye(8, dtype=bool) | np.eye(8, k=1, dtype=bool) | np.eye(8, k=-1, dtype=bool)
+POINTS = np.random.default_rng(0).uniform(-1, 1, (8, 3))
 
 
 def polar(matrix: torch.Tensor) -> torch.Tensor:
@@ -76,7 +77,7 @@ def test_what_is_no_matrix_moves_as_under_adamw() -> None:
 
 @pytest.mark.parametrize("name", [name for name in NETWORKS if name.endswith(("xs", "-s", "locator"))])
 def test_every_weight_is_trained_once(name: str) -> None:
-    network = build(name, CHAIN)
+    network = build(name, CHAIN, POINTS)
     optimizer = make_optimizer(network, TrainSettings(name, epochs=1))
     held = [id(parameter) for group in optimizer.param_groups for parameter in group["params"]]
     assert sorted(held) == sorted(id(parameter) for parameter in network.parameters())
@@ -87,7 +88,7 @@ def test_every_weight_is_trained_once(name: str) -> None:
 
 
 def test_a_gradient_scaler_that_overflows_moves_nothing() -> None:
-    network = build("gknet-xs", CHAIN)
+    network = build("gknet-xs", CHAIN, POINTS)
     optimizer = make_optimizer(network, TrainSettings(epochs=1, precision="16-mixed"))
     scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
     scaler.scale(torch.ones(()))  # it makes itself ready
@@ -103,7 +104,7 @@ def test_a_gradient_scaler_that_overflows_moves_nothing() -> None:
 
 
 def test_adamw_alone() -> None:
-    optimizer = make_optimizer(build("gknet-xs", CHAIN), TrainSettings(epochs=1, optimizer="adamw"))
+    optimizer = make_optimizer(build("gknet-xs", CHAIN, POINTS), TrainSettings(epochs=1, optimizer="adamw"))
     assert isinstance(optimizer, torch.optim.AdamW)
 
 

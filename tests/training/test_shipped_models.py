@@ -107,7 +107,7 @@ def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: Modu
 
 def initial(work: Path) -> dict[str, torch.Tensor]:
     spacecraft = SkdDataset(work / "frames", "val", CRAFT).spacecraft
-    return build("gknet-s", spacecraft.adjacency).state_dict()
+    return build("gknet-s", spacecraft.adjacency, spacecraft.points_m).state_dict()
 
 
 def scores_of(said: str, recipe: ModuleType) -> dict[float, float] | None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.network.heatmap import SIGMA_CELLS, Branches, Hints  # noqa: E402
 from gknet.training.batch import Batch  # noqa: E402
 from gknet.training.loss import gaussian_targets, heatmap_loss  # noqa: E402
-from gknet.training.tasks import FIRST_LOOK, KeypointTask  # noqa: E402
+from gknet.training.tasks import ATTITUDE, FIRST_LOOK, KeypointTask  # noqa: E402
 from tests.training.toy import toy_spacecraft  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -74,3 +77,23 @@ def test_a_network_that_looks_once_answers_for_every_keypoint_in_view() -> None:
     assert loss(Branches(told, TRUTH, TRUTH)) == pytest.approx(expected)
     assert loss(Branches(TRUTH, told, TRUTH), 0.2) == pytest.approx(0.2 * expected)
     assert loss(Branches(out_of_view, out_of_view, out_of_view), 0.2) == 0
+
+
+def test_the_belief_in_the_attitude_is_answered_for_where_a_pose_is_known() -> None:
+    bins = AttitudeBins(4)
+    quaternions = torch.nn.functional.normalize(torch.randn(2, 4), dim=1)
+    label = torch.from_numpy(bins.soft_label(quaternions.numpy())).float()
+    pose = torch.cat([torch.zeros(2, 3), quaternions], dim=1)
+
+    def counted(attitude: torch.Tensor, known: torch.Tensor, auxiliary: float = 0.2) -> float:
+        task = KeypointTask(toy_spacecraft(), 64, auxiliary, bins)
+        batch = replace(BATCH, pose=torch.where(known[:, None], pose, torch.nan))
+        return task.loss(Answers(Branches(TRUTH, TRUTH, None, None, attitude)), batch, CPU).item()
+
+    both, first, neither = torch.tensor([[True, True], [True, False], [False, False]])
+    right, mixed = label.clamp(min=1e-12).log(), torch.zeros_like(label)
+    assert counted(right, both) == pytest.approx(0, abs=1e-5)
+    divergence = (label * (label.clamp(min=1e-12) * len(label[0])).log()).sum(dim=1)  # from the even belief
+    assert counted(mixed, both) == pytest.approx(ATTITUDE * divergence.mean().item(), rel=1e-4)
+    assert counted(mixed, first) == pytest.approx(ATTITUDE * divergence[0].item(), rel=1e-4)
+    assert counted(mixed, neither) == 0

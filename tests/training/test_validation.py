@@ -35,7 +35,7 @@ class Middle(torch.nn.Module):
 def test_the_score_is_the_mean_over_all_rows(frames: SkdDataset) -> None:
     spacecraft = frames.spacecraft
     torch.manual_seed(0)
-    network = build("gknet-s", spacecraft.adjacency)
+    network = build("gknet-s", spacecraft.adjacency, spacecraft.points_m)
 
     def rmse_px(rows: list[int]) -> float:
         return validate_keypoints(network, CPU, frames, rows, spacecraft, 64).values["rmse_px"]

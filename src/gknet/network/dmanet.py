@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.errors import GknetError
+from gknet.network.attitude import AttitudeHead
 from gknet.network.backbone import POSITION_WIDTH, ConvNorm, ResidualBlock, check_input, normalised, position_code
 
 KERNELS = (3, 5, 7)
@@ -34,7 +35,7 @@ class DMANetConfig:
     growth   channels that each MAB of a level adds
     blocks   MABs of each level
     head     channels of each branch
-    bins     cells of the attitude to a turn of an Euler angle (gknet.direct.AttitudeBins)
+    bins     cells of the attitude to a turn of an Euler angle (gknet.attitude.AttitudeBins)
     """
 
     width: tuple[int, int, int, int]
@@ -120,8 +121,7 @@ class DMANet(nn.Module):
         self.votes = nn.Sequential(ConvNorm(inputs, config.head, 1), nn.Conv2d(config.head, 3, 1))
         self.depth_cells = ConvNorm(inputs, config.head, 1)
         self.depth = nn.Linear(config.head, 1)
-        self.attitude_cells = ConvNorm(inputs, config.head, 1)
-        self.attitude = nn.Linear(config.head, config.bins**3 // 2)
+        self.attitude = AttitudeHead(inputs, config.head, config.bins**3 // 2)
 
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
         check_input(image)
@@ -131,8 +131,7 @@ class DMANet(nn.Module):
         code = position_code(x.shape[2], x.shape[3], x)
         x = x + self.place(code.permute(1, 2, 0)).permute(2, 0, 1)  # a mean over cells would forget where they are
         depth = self.depth(self.depth_cells(x).mean(dim=(2, 3)))[:, 0]
-        attitude = self.attitude(self.attitude_cells(x).mean(dim=(2, 3)))
-        return Branches(self._offset(self.votes(x).float()), depth.float(), attitude.float())
+        return Branches(self._offset(self.votes(x).float()), depth.float(), self.attitude(x))
 
     @staticmethod
     def _offset(votes: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 2"]:

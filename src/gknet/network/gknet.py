@@ -10,7 +10,9 @@ from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gknet.attitude import AttitudeBins
 from gknet.errors import GknetError
+from gknet.network.attitude import AttitudeHead, AttitudePrior
 from gknet.network.backbone import (
     POSITION_WIDTH,
     ContextBlock,
@@ -21,7 +23,7 @@ from gknet.network.backbone import (
     position_code,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
-from gknet.network.heatmap import Branches, HeatmapNetwork, Hints, log_belief
+from gknet.network.heatmap import SHARPNESS, Branches, HeatmapNetwork, Hints, log_belief
 
 CONVICTION = 4
 """Power to which the first look's belief is raised before the second: whoever is in two minds takes a side."""
@@ -36,6 +38,7 @@ class GKNetConfig:
     node_width     channels of a graph node and of the image cells that it attends to
     node_layers    layers of the graph decoder
     heads          attention heads
+    bins           cells to a turn of the attitude that keypoints are expected by (decision 0016); 0 expects nothing
     graph          "skeleton", "identity" (no edges), "random" (as many edges, anywhere) or "none" (no graph branch)
     """
 
@@ -44,6 +47,7 @@ class GKNetConfig:
     node_width: int = 128
     node_layers: int = 3
     heads: int = 4
+    bins: int = 0
     graph: str = "skeleton"
 
     def __post_init__(self) -> None:
@@ -55,10 +59,20 @@ class GKNetConfig:
             raise GknetError(f"node_width: expected a multiple of heads ({self.heads}), got {self.node_width}")
 
 
+PRIOR_CELLS, ATTITUDE_WIDTH = 8, 128
+"""Side of the maps in which an attitude puts keypoints; channels of what tells the attitude."""
+
+
 class GKNet(HeatmapNetwork):
     """Image -> one heatmap per keypoint at a quarter of the input's resolution."""
 
-    def __init__(self, config: GKNetConfig, adjacency: Bool[ndarray, "n n"], loss: str = "likelihood") -> None:
+    def __init__(
+        self,
+        config: GKNetConfig,
+        adjacency: Bool[ndarray, "n n"],
+        points_m: Float[ndarray, "n 3"],
+        loss: str = "likelihood",
+    ) -> None:
         super().__init__(loss, stride=4)
         self.config = config
         self.looks_twice = config.graph != "none"
@@ -72,6 +86,10 @@ class GKNet(HeatmapNetwork):
         self.pixel_head = nn.Conv2d(config.pyramid_width, keypoints, 1)
         nn.init.normal_(self.pixel_head.weight, std=0.01)
         nn.init.zeros_(self.pixel_head.bias)  # type: ignore[arg-type]
+        if config.bins:
+            bins = AttitudeBins(config.bins)
+            self.attitude = AttitudeHead(widths[3] + config.node_width, ATTITUDE_WIDTH, bins.count)
+            self.prior = AttitudePrior(torch.from_numpy(bins.places(points_m, PRIOR_CELLS)).float())
         self.decoder: GraphDecoder | None = None
         if config.graph != "none":
             self._build_graph_branch(adjacency)
@@ -96,13 +114,17 @@ class GKNet(HeatmapNetwork):
         coarse = features[3]
         cells = self.context(self._cells(self.coarse_cells(coarse)))  # (b, hw/1024, c)
         context = cells.transpose(1, 2).reshape(coarse.shape[0], -1, coarse.shape[2], coarse.shape[3])
-        up = self.pyramid([*features[:3], torch.cat([coarse, context.to(coarse.dtype)], dim=1)])
+        known = torch.cat([coarse, context.to(coarse.dtype)], dim=1)
+        up = self.pyramid([*features[:3], known])
         pixels = self.pixel_head(up)  # eq. 1
+        attitude = self.attitude(known) if self.config.bins else None
+        if attitude is not None:
+            pixels = pixels + self.prior(attitude, *pixels.shape[2:]) / SHARPNESS
         if self.decoder is None:
-            return Branches(pixels, pixels, None)
+            return Branches(pixels, pixels, None, attitude=attitude)
         memory = torch.cat([cells, self._cells(self.fine_cells(features[2]))], dim=1)
         nodes, first = self._graph_maps(memory, up, pixels, hints)
-        return Branches(self.fusion(pixels, nodes), pixels, nodes, first)
+        return Branches(self.fusion(pixels, nodes), pixels, nodes, first, attitude)
 
     def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
         """A map as a list of cells that know where they are."""

@@ -45,13 +45,15 @@ def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"
 class Branches(NamedTuple):
     """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch.
 
-    first  the maps of the first look of a network that looks twice, else None
+    first     the maps of the first look of a network that looks twice, else None
+    attitude  (b, k) logits of the attitude's classes of a network that has a belief in it, else None
     """
 
     fused: Tensor
     pixels: Tensor
     nodes: Tensor | None
     first: Tensor | None = None
+    attitude: Tensor | None = None
 
 
 class Hints(NamedTuple):

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from gknet.crop import Crop
-from gknet.direct import CropPose
+from gknet.direct import CropPose, has_square_pixels
 from gknet.errors import GknetError
 from gknet.frame import Box, Frame
 from gknet.spacecraft import Spacecraft
@@ -49,6 +49,7 @@ class Cache:
     in_view   (m, n) the keypoint is inside the picture and inside the crop, hidden or not
     boxes_px  (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the picture
     poses     (m, 7) the true pose as the crop shows it, `CropPose.vector`; NaN where the origin is behind the camera
+              or pixels are not square, since a turned picture is of no pose then
     """
 
     images: UInt8[ndarray, "m s s 3"]
@@ -119,7 +120,8 @@ def cached_row(frame: Frame, spacecraft: Spacecraft, window: Window, size: int) 
     inside = inside & ((points >= 0) & (points <= size)).all(axis=1)
     corners = crop.to_input(np.array([[box.x0, box.y0], [box.x1, box.y1]]))
     assert frame.cam_from_body is not None
-    pose = CropPose.of(frame.cam_from_body, frame.camera, crop, spacecraft.diameter_m)
+    square = has_square_pixels(frame.camera)
+    pose = CropPose.of(frame.cam_from_body, frame.camera, crop, spacecraft.diameter_m) if square else None
     vector = np.full(7, np.nan) if pose is None else pose.vector
     return _Row(crop.cut(frame.image), points, inside, corners.ravel(), vector)
 

@@ -70,11 +70,11 @@ def in_half(tensor: Tensor) -> bool:
 
 @torch.no_grad()
 def round_weights(network: nn.Module) -> None:
-    for parameter in network.parameters():
-        if in_half(parameter):
-            if parameter.abs().max() > torch.finfo(torch.float16).max:
+    for tensor in (*network.parameters(), *network.buffers()):
+        if in_half(tensor):
+            if tensor.abs().max() > torch.finfo(torch.float16).max:
                 raise GknetError("export: a weight is too large for 16 bits; the training has diverged")
-            parameter.copy_(parameter.half().float())
+            tensor.copy_(tensor.half().float())
 
 
 def onnx_graph(network: Network, example: Float[Tensor, "b 3 s s"]) -> onnx.ModelProto:
@@ -183,7 +183,7 @@ def export_run(folder: Path, out: Path, tolerance: float = TOLERANCE) -> Exporte
     """
     run = load_run(folder)
     spacecraft = spacecraft_from_toml(run.spacecraft_toml, str(folder / "run.json"))
-    network = build(run.network, spacecraft.adjacency, run.graph, run.loss)
+    network = build(run.network, spacecraft.adjacency, spacecraft.points_m, run.graph, run.loss)
     weights = load_weights(folder / BEST)
     try:
         network.load_state_dict(weights)

@@ -67,7 +67,7 @@ def train(
     spacecraft = training_data.spacecraft
     fabric = make_fabric(settings)
     torch.manual_seed(settings.seed)
-    network = build(settings.network, spacecraft.adjacency, settings.graph, settings.chosen_loss)
+    network = build(settings.network, spacecraft.adjacency, spacecraft.points_m, settings.graph, settings.chosen_loss)
     if settings.init is not None and not resume:
         taken, total = warm_start(network, settings.init)
         fabric.print(f"{settings.init}: {taken} of {total} tensors taken")

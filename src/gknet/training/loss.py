@@ -58,6 +58,17 @@ def likelihood_loss(
     return (divergence * weight).sum() / weight.sum().clamp(min=1)
 
 
+def attitude_loss(
+    attitude: Float[Tensor, "b k"], label: Float[Tensor, "b k"], weight: Float[Tensor, "b"]
+) -> Float[Tensor, ""]:
+    """Divergence of the belief in the attitude's classes from the soft label, averaged where `weight` is 1. 0 at best.
+
+    attitude: logits; label: `AttitudeBins.soft_label`
+    """
+    divergence = (label * (label.clamp(min=TINY).log() - attitude.log_softmax(dim=1))).sum(dim=1)
+    return (divergence * weight).sum() / weight.sum().clamp(min=1)
+
+
 def direct_loss(
     branches: Branches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, "b"]
 ) -> Float[Tensor, ""]:
@@ -67,10 +78,9 @@ def direct_loss(
     """
     offset = functional.smooth_l1_loss(branches.offset, pose[:, :2], beta=SMOOTH, reduction="none").sum(dim=1)
     depth = functional.smooth_l1_loss(branches.log_depth, pose[:, 2], beta=SMOOTH, reduction="none")
-    belief = branches.attitude.log_softmax(dim=1)
-    divergence = (label * (label.clamp(min=TINY).log() - belief)).sum(dim=1)
-    loss = OFFSET_WEIGHT * offset + DEPTH_WEIGHT * depth + divergence
-    return (loss * weight).sum() / weight.sum().clamp(min=1)
+    place = OFFSET_WEIGHT * offset + DEPTH_WEIGHT * depth
+    placed = (place * weight).sum() / weight.sum().clamp(min=1)
+    return placed + attitude_loss(branches.attitude, label, weight)
 
 
 def box_iou(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b"]:

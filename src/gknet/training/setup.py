@@ -9,11 +9,13 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
+from gknet.attitude import AttitudeBins
 from gknet.dataset.skd import SkdDataset
-from gknet.direct import AttitudeBins
+from gknet.direct import has_square_pixels
 from gknet.errors import GknetError
 from gknet.network.build import Network
 from gknet.network.dmanet import DMANet
+from gknet.network.gknet import GKNet
 from gknet.network.locator import Locator
 from gknet.spacecraft import Spacecraft
 from gknet.training.cache import Cache, FrameSource, build_cache
@@ -24,8 +26,6 @@ from gknet.training.validation import validation_rows
 BF16_FLAGS = {"avx512_bf16", "amx_bf16"}
 PICTURE_SIZE = 256
 """Side of a cached whole picture: the locator's input."""
-SQUARE = 0.01
-"""How far fx / fy may be from 1 where pictures are turned."""
 STAMPED = 64
 """So many image files, evenly spread, tell by size and time whether the pictures are still the same."""
 
@@ -68,7 +68,8 @@ def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings)
         return LocatorTask(spacecraft, network.stride, settings.input_size)
     if isinstance(network, DMANet):
         return DirectTask(spacecraft, AttitudeBins(network.config.bins), settings.input_size)
-    return KeypointTask(spacecraft, settings.input_size, settings.auxiliary)
+    bins = AttitudeBins(network.config.bins) if isinstance(network, GKNet) and network.config.bins else None
+    return KeypointTask(spacecraft, settings.input_size, settings.auxiliary, bins)
 
 
 def check_cameras(network: Network, frames: FrameSource) -> None:
@@ -80,8 +81,8 @@ def check_cameras(network: Network, frames: FrameSource) -> None:
             frame = frames.frame(i, image=False)
         except GknetError:  # a bad label is left out by the cache
             continue
-        ratio = frame.camera.matrix[0, 0] / frame.camera.matrix[1, 1]
-        if abs(ratio - 1) > SQUARE:
+        if not has_square_pixels(frame.camera):
+            ratio = frame.camera.matrix[0, 0] / frame.camera.matrix[1, 1]
             raise GknetError(
                 f"{frame.name}: expected square pixels, got fx / fy of {ratio:.3f}; resize the pictures to train on"
             )

@@ -10,18 +10,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gknet.direct import AttitudeBins
+from gknet.attitude import AttitudeBins
 from gknet.frame import Frame
 from gknet.network.dmanet import DMANet
 from gknet.network.gknet import GKNet
 from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork, Hints
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
-from gknet.training.loss import direct_loss, gaussian_targets, heatmap_loss, likelihood_loss, locator_loss
+from gknet.training.loss import (
+    attitude_loss,
+    direct_loss,
+    gaussian_targets,
+    heatmap_loss,
+    likelihood_loss,
+    locator_loss,
+)
 from gknet.training.validation import Validation, validate_direct, validate_keypoints, validate_locator
 
 FIRST_LOOK = 0.5
 """Weight of the loss on a first look."""
+
+ATTITUDE = 0.5
+"""Weight of the loss on a keypoint network's belief in the attitude."""
 
 LOSSES = {"likelihood": likelihood_loss, "squared": heatmap_loss}
 
@@ -37,9 +47,19 @@ class Task(Protocol):
     ) -> Validation: ...
 
 
+def labelled(
+    batch: Batch, bins: AttitudeBins, device: torch.device
+) -> tuple[Float[Tensor, "b 7"], Float[Tensor, "b k"], Float[Tensor, "b"]]:
+    """Poses, soft labels of their attitudes, and 1 where there is a pose; 0 where there is none."""
+    known = batch.pose.isfinite().all(dim=1)
+    pose = torch.where(known[:, None], batch.pose, 0.0)
+    label = torch.from_numpy(bins.soft_label(pose[:, 3:].numpy())).float()
+    return pose.to(device), label.to(device), known.float().to(device)
+
+
 @dataclass(frozen=True)
 class KeypointTask:
-    """Maps against Gaussians; `auxiliary` is the weight of each branch's own loss.
+    """Maps against Gaussians, and a belief in the attitude's `bins`; `auxiliary` weighs each branch's own loss.
 
     A network that looks twice answers for its first look too, and is told some of the places before the second, so
     that it learns what neighbours tell of a keypoint; for those that it was told it does not answer.
@@ -48,6 +68,7 @@ class KeypointTask:
     spacecraft: Spacecraft
     input_size: int
     auxiliary: float
+    bins: AttitudeBins | None = None
     draw: Draw = draw_keypoints
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
@@ -69,6 +90,9 @@ class KeypointTask:
         if self.auxiliary > 0 and branches.nodes is not None:
             parts = measure(branches.pixels, targets, weight) + measure(branches.nodes, targets, weight)
             loss = loss + self.auxiliary * parts
+        if branches.attitude is not None and self.bins is not None:
+            _, label, known = labelled(batch, self.bins, device)
+            loss = loss + ATTITUDE * attitude_loss(branches.attitude, label, known)
         return loss
 
     def validate(
@@ -88,10 +112,7 @@ class DirectTask:
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
         branches = cast(DMANet, network).branches(batch.network_input(device))
-        known = batch.pose.isfinite().all(dim=1)
-        pose = torch.where(known[:, None], batch.pose, 0.0)
-        label = torch.from_numpy(self.bins.soft_label(pose[:, 3:].numpy())).float()
-        return direct_loss(branches, pose.to(device), label.to(device), known.float().to(device))
+        return direct_loss(branches, *labelled(batch, self.bins, device))
 
     def validate(
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]

@@ -12,9 +12,10 @@ from numpy import ndarray
 from torch import nn
 
 from gknet import metrics
+from gknet.attitude import AttitudeBins
 from gknet.calibration import BARE, calibrated, sight
 from gknet.decode import Decoding
-from gknet.direct import AttitudeBins, DirectEstimator
+from gknet.direct import DirectEstimator
 from gknet.errors import GknetError
 from gknet.estimator import Estimator
 from gknet.frame import Frame

@@ -1,0 +1,65 @@
+"""Laws of the prior: it says what the attitude says, excludes nothing outright, and reaches the heatmaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from gknet.attitude import AttitudeBins  # noqa: E402
+from gknet.network.attitude import OPEN_MIND, AttitudePrior  # noqa: E402
+from tests.network.tiny import points, tiny  # noqa: E402
+
+BINS = AttitudeBins(6)
+PLACES = torch.from_numpy(BINS.places(points(5), 8)).float()
+
+
+def sure_of(*classes: int) -> torch.Tensor:
+    """Logits of one belief, spread evenly over `classes`."""
+    logits = torch.full((1, BINS.count), -40.0)
+    logits[0, list(classes)] = 0
+    return logits
+
+
+def test_a_prior_says_where_the_attitude_puts_each_keypoint() -> None:
+    prior = AttitudePrior(PLACES)
+    for chosen in (0, 17, 80):
+        found = prior(sure_of(chosen), 8, 8)[0]
+        torch.testing.assert_close(found, (64 * PLACES[chosen] + OPEN_MIND).log())
+    both = prior(sure_of(3, 50), 8, 8)[0]  # in two minds: the mean of two likelihoods, not of their logarithms
+    torch.testing.assert_close(both, (32 * (PLACES[3] + PLACES[50]) + OPEN_MIND).log())
+
+
+def test_a_prior_excludes_nothing_outright_and_has_any_size() -> None:
+    found = AttitudePrior(PLACES)(sure_of(9).expand(2, -1), 16, 24)
+    assert found.shape == (2, 5, 16, 24)
+    assert found.min() >= np.log(OPEN_MIND) - 1e-6
+    assert found.max() > 1
+
+
+def test_places_belong_to_the_spacecraft_and_not_to_the_weights() -> None:
+    assert list(AttitudePrior(PLACES).state_dict()) == ["gain"]
+
+
+@pytest.mark.parametrize("graph", ["skeleton", "none"])
+def test_the_belief_in_the_attitude_moves_the_maps(graph: str) -> None:
+    """With features that say nothing, keypoints are where the attitude puts them."""
+    network = tiny(5, graph, bins=6).eval()
+    torch.nn.init.zeros_(network.pixel_head.weight)
+    network.attitude.classes.weight.data.zero_()
+    image = torch.rand(1, 3, 128, 128)
+    for chosen in (4, 60):
+        network.attitude.classes.bias.data = sure_of(chosen)[0]
+        branches = network.branches(image)
+        torch.testing.assert_close(branches.attitude, sure_of(chosen))
+        highest = branches.pixels.flatten(2).argmax(dim=2)[0]
+        cells = torch.stack([highest // 32, highest % 32]) // 4
+        expected = PLACES[chosen].flatten(1).argmax(dim=1)
+        assert (cells - torch.stack([expected // 8, expected % 8])).abs().max() <= 1
+
+
+def test_a_network_without_bins_expects_nothing() -> None:
+    network = tiny(5, bins=0)
+    assert network.branches(torch.rand(1, 3, 64, 64)).attitude is None
+    assert not [name for name in network.state_dict() if "attitude" in name or "prior" in name]
