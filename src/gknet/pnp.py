@@ -215,17 +215,20 @@ def _residuals_px(problem: _Problem, pose: Pose) -> Float[ndarray, "k"]:
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def _projected(problem: _Problem, pose: Pose) -> tuple[Float[ndarray, "n 2"], Float[ndarray, "n 2 6"]]:
-    """Pixels of all points, and their derivative by (dw, dt): exp([dw]x) R, t + dt."""
+def _projected(
+    problem: _Problem, pose: Pose
+) -> tuple[Float[ndarray, "n 2"], Float[ndarray, "n 2 6"], Float[ndarray, "n"]]:
+    """Pixels of all points, their derivative by (dw, dt): exp([dw]x) R, t + dt, and their depth in metres."""
     turned = problem.points_m @ pose.rotation.T
+    placed = turned + pose.translation_m
     pixels, derivatives = cv2.projectPoints(
-        turned + pose.translation_m, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
+        placed, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
     )
     by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
     x, y, z = turned.T[:, :, None]
     a, b, c = by_point.transpose(2, 0, 1)
     by_turn = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=2)  # a . (dw x p) = dw . (p x a)
-    return pixels[:, 0], np.concatenate([by_turn, by_point], axis=2)
+    return pixels[:, 0], np.concatenate([by_turn, by_point], axis=2), placed[:, 2]
 
 
 def _edge_errors(
@@ -262,14 +265,14 @@ def _system(
     problem: _Problem, pose: Pose, use: Bool[ndarray, "k"], weigh: Weigh
 ) -> tuple[float, Float[ndarray, "6 6"], Float[ndarray, "6"]]:
     """Cauchy's cost, the normal matrix and the gradient of the whitened errors of keypoints in `use` and of edges."""
-    all_pixels, all_derivatives = _projected(problem, pose)
+    all_pixels, all_derivatives, depth_m = _projected(problem, pose)
     derivative, residual = all_derivatives[problem.usable], problem.pixels - all_pixels[problem.usable]
     ratio = (residual * (problem.information @ residual[..., None])[..., 0]).sum(axis=1) / ROBUST_SIGMAS**2
     weight = np.where(use, weigh(ratio), 0.0)
     weighted = (problem.information @ derivative * weight[:, None, None]).reshape(-1, 6).T
     cost, normal = np.log1p(ratio[use]).sum(), weighted @ derivative.reshape(-1, 6)
     gradient = weighted @ residual.ravel()
-    if problem.edges is not None and (pose.transform(problem.points_m)[:, 2] > 0).all():
+    if problem.edges is not None and (depth_m > 0).all():
         error, by_pose = _edge_errors(problem.edges, all_pixels, all_derivatives)
         ratio = error**2 / ROBUST_SIGMAS**2
         weighted = by_pose.T * weigh(ratio)
