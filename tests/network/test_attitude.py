@@ -39,24 +39,55 @@ def test_a_prior_excludes_nothing_outright_and_has_any_size() -> None:
 
 
 def test_places_belong_to_the_spacecraft_and_not_to_the_weights() -> None:
-    assert list(AttitudePrior(PLACES).state_dict()) == ["gain"]
+    assert set(AttitudePrior(PLACES).state_dict()) == {"gain", "trust"}
+
+
+def test_keypoints_in_two_minds_agree_on_the_attitude_that_suits_them_all() -> None:
+    """Each keypoint alone deems the twin likelier, or knows nothing, but for two that cannot be at the twin's."""
+    prior = AttitudePrior(PLACES)
+    true, twin = 30, 47
+    belief = (0.4 * PLACES[true] + 0.6 * PLACES[twin])[None]
+    belief[0, 4] = 1 / 64
+    assert prior.evidence(belief)[0].argmax() == twin
+    belief[0, :2] = PLACES[true, :2]
+    evidence = prior.evidence(belief)[0]
+    assert evidence.argmax() == true
+    expected = prior.trust * (64 * (belief[0] * PLACES[true]).sum(dim=(1, 2)) + OPEN_MIND).log().sum()
+    assert evidence[true].item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_evidence_is_the_same_at_any_resolution() -> None:
+    prior = AttitudePrior(PLACES)
+    fine = PLACES[:1].repeat_interleave(3, dim=2).repeat_interleave(3, dim=3) / 9
+    torch.testing.assert_close(prior.evidence(fine), prior.evidence(PLACES[:1]))
 
 
 @pytest.mark.parametrize("graph", ["skeleton", "none"])
-def test_the_belief_in_the_attitude_moves_the_maps(graph: str) -> None:
-    """With features that say nothing, keypoints are where the attitude puts them."""
+def test_the_belief_in_the_attitude_moves_the_maps_and_is_moved_by_them(graph: str) -> None:
+    """With features that say nothing, keypoints are where the attitude puts them; sure keypoints overrule it."""
     network = tiny(5, graph, bins=6).eval()
-    torch.nn.init.zeros_(network.pixel_head.weight)
     network.attitude.classes.weight.data.zero_()
+    if graph != "none":
+        torch.nn.init.zeros_(network.node_filter.weight)
+        torch.nn.init.zeros_(network.node_filter.bias)
+    seen = torch.zeros(1, 5, 32, 32)
+    network.pixel_head.register_forward_hook(lambda module, given, out: seen)
     image = torch.rand(1, 3, 128, 128)
     for chosen in (4, 60):
+        seen = torch.zeros(1, 5, 32, 32)
         network.attitude.classes.bias.data = sure_of(chosen)[0]
         branches = network.branches(image)
-        torch.testing.assert_close(branches.attitude, sure_of(chosen))
+        assert branches.attitude is not None
+        assert branches.attitude[0].argmax() == chosen
         highest = branches.pixels.flatten(2).argmax(dim=2)[0]
         cells = torch.stack([highest // 32, highest % 32]) // 4
         expected = PLACES[chosen].flatten(1).argmax(dim=1)
         assert (cells - torch.stack([expected // 8, expected % 8])).abs().max() <= 1
+        other = 80
+        network.attitude.classes.bias.data = sure_of(chosen, other)[0] + torch.eye(BINS.count)[chosen]
+        seen = PLACES[other][None].clamp(min=1e-6).log() / 10
+        seen = torch.nn.functional.interpolate(seen, size=(32, 32))
+        assert network.branches(image).attitude[0].argmax() == other
 
 
 def test_a_network_without_bins_expects_nothing() -> None:

@@ -97,15 +97,16 @@ def test_a_message_knows_both_of_its_ends() -> None:
 
 def glances_at(pixels: torch.Tensor, hints: Hints | None = None) -> list[torch.Tensor]:
     """Codes of the places (n, 34) that nodes see where the other branch has the maps `pixels`, at each glance."""
-    network = tiny(pixels.shape[1]).eval()
+    network = tiny(pixels.shape[1], bins=0).eval()
     assert network.decoder is not None
+    network.pixel_head.register_forward_hook(lambda module, given, out: pixels)
     with torch.no_grad():
         network.node_filter.weight.zero_()
         network.node_filter.bias.zero_()
     glances: list[torch.Tensor] = []
     for layer in network.decoder.layers:
         layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0][0, :, 8:]))
-    network._graph_maps(torch.randn(1, 6, 8), torch.randn(1, 8, 16, 16), pixels, hints)
+    network.branches(torch.rand(1, 3, 64, 64), hints)
     assert len(glances) == 4  # two layers, two looks
     return glances
 

@@ -26,11 +26,12 @@ class AttitudeHead(nn.Module):
 
 
 class AttitudePrior(nn.Module):
-    """Logits of the attitude's classes -> the logarithm of where they expect each keypoint, about 0 in the mean.
+    """Between the belief in the attitude and those in the keypoints' places: what each says of the other.
 
     A keypoint by itself may be in two minds about twin places; an attitude puts all keypoints on one side.
 
     places   (k, n, cells, cells), `gknet.attitude.AttitudeBins.places`
+    gain     of what the attitude says, learnt; trust in what keypoints say, likewise: they err alike, so below 1
     """
 
     places: Tensor
@@ -39,10 +40,23 @@ class AttitudePrior(nn.Module):
         super().__init__()
         self.register_buffer("places", places, persistent=False)  # the spacecraft's, not the weights'
         self.gain = nn.Parameter(torch.ones(1))
+        self.trust = nn.Parameter(torch.full((1,), 0.3))
 
     def forward(self, attitude: Float[Tensor, "b k"], height: int, width: int) -> Float[Tensor, "b n height width"]:
+        """Logits of the attitude's classes -> the logarithm of where they expect each keypoint, about 0 in the mean."""
         cells = self.places.shape[-1]
         expected = attitude.float().softmax(dim=1) @ self.places.flatten(1)
         expected = expected.reshape(-1, *self.places.shape[1:])
         log_prior = (cells**2 * expected + OPEN_MIND).log()
         return self.gain * functional.interpolate(log_prior, size=(height, width), mode="bilinear")
+
+    def evidence(self, belief: Float[Tensor, "b n h w"]) -> Float[Tensor, "b k"]:
+        """Where each keypoint is believed to be, shares of 1 -> what all of them together say of each class, in logits.
+
+        h and w are multiples of the cells. A class that suits all keypoints is far ahead of those that suit some.
+        """
+        cells = self.places.shape[-1]
+        height, width = belief.shape[2:]
+        shares = functional.avg_pool2d(belief, (height // cells, width // cells)) * (height * width)
+        agreement = torch.einsum("bnc,knc->bkn", shares.flatten(2), self.places.flatten(2))
+        return self.trust * (agreement + OPEN_MIND).log().sum(dim=2)

@@ -116,52 +116,64 @@ class GKNet(HeatmapNetwork):
         context = cells.transpose(1, 2).reshape(coarse.shape[0], -1, coarse.shape[2], coarse.shape[3])
         known = torch.cat([coarse, context.to(coarse.dtype)], dim=1)
         up = self.pyramid([*features[:3], known])
-        pixels = self.pixel_head(up)  # eq. 1
+        alone = self.pixel_head(up)  # eq. 1
         attitude = self.attitude(known) if self.config.bins else None
-        if attitude is not None:
-            pixels = pixels + self.prior(attitude, *pixels.shape[2:]) / SHARPNESS
+        pixels = self._expected(alone, attitude)
         if self.decoder is None:
+            attitude = self._agreed(attitude, pixels)
+            pixels = self._expected(alone, attitude)
             return Branches(pixels, pixels, None, attitude=attitude)
         memory = torch.cat([cells, self._cells(self.fine_cells(features[2]))], dim=1)
-        nodes, first = self._graph_maps(memory, up, pixels, hints)
-        return Branches(self.fusion(pixels, nodes), pixels, nodes, first, attitude)
-
-    def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
-        """A map as a list of cells that know where they are."""
-        code = position_code(features.shape[2], features.shape[3], features).flatten(1).T
-        return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
-
-    def _graph_maps(
-        self,
-        memory: Float[Tensor, "b m c"],
-        up: Float[Tensor, "b p h w"],
-        pixels: Float[Tensor, "b n h w"],
-        hints: Hints | None,
-    ) -> tuple[Float[Tensor, "b n h w"], Float[Tensor, "b n h w"]]:
-        """Each node is a 1x1 filter over pixels that know where they are: it says where its keypoint is.
-
-        Between the layers of the decoder it sees what is where it believes its keypoint to be (decision 0012); in the
-        second look, where the first one put it, and so do its neighbours by its messages (decision 0013).
-        Returns its map, and what the first look made of both branches.
-        """
-        assert self.decoder is not None
-        code = position_code(up.shape[2], up.shape[3], up)
-        along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
-        places = functional.relu(self.pixel_features(up) + along)
-        seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
+        places, seen = self._sight(up)
 
         def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
             # A plain sum: the fusion would be a way from node to node beside the edges.
             return log_belief(pixels + self._node_maps(nodes, places)).exp() @ seen
 
         first = pixels + self._node_maps(self.decoder(memory, glance), places)
-        belief = (CONVICTION * log_belief(first.detach())).softmax(dim=2)
-        if hints is not None:
-            truth = hints.maps.flatten(2)
-            truth = truth / truth.sum(dim=2, keepdim=True).clamp(min=1e-12)
-            belief = torch.where(hints.told[:, :, None], truth, belief)
-        found = belief @ seen
-        return self._node_maps(self.decoder(memory, lambda nodes: found), places), first
+        found = self._convinced(first, hints) @ seen
+        nodes = self._node_maps(self.decoder(memory, lambda nodes: found), places)
+        attitude = self._agreed(attitude, first)  # not told to the nodes: another way from one to the other
+        pixels = self._expected(alone, attitude)
+        return Branches(self.fusion(pixels, nodes), pixels, nodes, first, attitude)
+
+    def _expected(self, maps: Float[Tensor, "b n h w"], attitude: Float[Tensor, "b k"] | None) -> Tensor:
+        """Maps (b, n, h, w) with what the attitude says of each keypoint's place (decision 0016)."""
+        return maps if attitude is None else maps + self.prior(attitude, *maps.shape[2:]) / SHARPNESS
+
+    def _agreed(self, attitude: Float[Tensor, "b k"] | None, maps: Float[Tensor, "b n h w"]) -> Tensor | None:
+        """The belief in the attitude (b, k), after a look at where the keypoints seem to be."""
+        if attitude is None:
+            return None
+        return attitude + self.prior.evidence(log_belief(maps.detach()).exp().reshape(maps.shape))
+
+    def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
+        """A map as a list of cells that know where they are."""
+        code = position_code(features.shape[2], features.shape[3], features).flatten(1).T
+        return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
+
+    def _sight(self, up: Float[Tensor, "b p h w"]) -> tuple[Float[Tensor, "b p h w"], Float[Tensor, "b hw s"]]:
+        """Pixels that know where they are, and what a node sees of each at a glance.
+
+        Each node is a 1x1 filter over these pixels: it says where its keypoint is. Between the layers of the decoder it
+        sees what is where it believes its keypoint to be (decision 0012); in the second look, where the first one put
+        it, and so do its neighbours by its messages (decision 0013).
+        """
+        code = position_code(up.shape[2], up.shape[3], up)
+        along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
+        places = functional.relu(self.pixel_features(up) + along)
+        seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
+        return places, seen
+
+    @staticmethod
+    def _convinced(maps: Float[Tensor, "b n h w"], hints: Hints | None) -> Float[Tensor, "b n hw"]:
+        """Where nodes look the second time: the sharpened belief of the maps, or what they are told."""
+        belief = (CONVICTION * log_belief(maps.detach())).softmax(dim=2)
+        if hints is None:
+            return belief
+        truth = hints.maps.flatten(2)
+        truth = truth / truth.sum(dim=2, keepdim=True).clamp(min=1e-12)
+        return torch.where(hints.told[:, :, None], truth, belief)
 
     def _node_maps(self, nodes: Float[Tensor, "b n c"], places: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
         # (b, n, p + 1), the last one a bias; scaled so that one step moves a map by little
