@@ -130,11 +130,12 @@ class GKNet(HeatmapNetwork):
             # A plain sum: the fusion would be a way from node to node beside the edges.
             return log_belief(pixels + self._node_maps(nodes, places)).exp() @ seen
 
-        first = pixels + self._node_maps(self.decoder(memory, glance), places)
-        found = self._convinced(first, hints) @ seen
-        nodes = self._node_maps(self.decoder(memory, lambda nodes: found), places)
-        attitude = self._agreed(attitude, first)  # not told to the nodes: another way from one to the other
+        nodes = self._node_maps(self.decoder(memory, glance), places)
+        first = pixels + nodes
+        attitude = self._agreed(attitude, first)
         pixels = self._expected(alone, attitude)
+        found = self._convinced(pixels + nodes, hints) @ seen
+        nodes = self._node_maps(self.decoder(memory, lambda nodes: found), places)
         return Branches(self.fusion(pixels, nodes), pixels, nodes, first, attitude)
 
     def _expected(self, maps: Float[Tensor, "b n h w"], attitude: Float[Tensor, "b k"] | None) -> Tensor:
