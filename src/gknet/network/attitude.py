@@ -38,16 +38,17 @@ class AttitudePrior(nn.Module):
 
     def __init__(self, places: Float[Tensor, "k n cells cells"]) -> None:
         super().__init__()
-        self.register_buffer("places", places, persistent=False)  # the spacecraft's, not the weights'
+        self.cells = places.shape[-1]
+        # Keypoint by keypoint, the classes last: read as it lies by both products. The spacecraft's, not the weights'.
+        self.register_buffer("places", places.flatten(2).permute(1, 2, 0).contiguous(), persistent=False)
         self.gain = nn.Parameter(torch.ones(1))
         self.trust = nn.Parameter(torch.full((1,), 0.3))
 
     def forward(self, attitude: Float[Tensor, "b k"], height: int, width: int) -> Float[Tensor, "b n height width"]:
         """Logits of the attitude's classes -> the logarithm of where they expect each keypoint, about 0 in the mean."""
-        cells = self.places.shape[-1]
-        expected = attitude.float().softmax(dim=1) @ self.places.flatten(1)
-        expected = expected.reshape(-1, *self.places.shape[1:])
-        log_prior = (cells**2 * expected + OPEN_MIND).log()
+        expected = self.places.flatten(0, 1) @ attitude.float().softmax(dim=1).T  # (n cells cells, b)
+        expected = expected.T.reshape(-1, len(self.places), self.cells, self.cells)
+        log_prior = (self.cells**2 * expected + OPEN_MIND).log()
         return self.gain * functional.interpolate(log_prior, size=(height, width), mode="bilinear")
 
     def evidence(self, belief: Float[Tensor, "b n h w"]) -> Float[Tensor, "b k"]:
@@ -55,8 +56,7 @@ class AttitudePrior(nn.Module):
 
         h and w are multiples of the cells. A class that suits all keypoints is far ahead of those that suit some.
         """
-        cells = self.places.shape[-1]
         height, width = belief.shape[2:]
-        shares = functional.avg_pool2d(belief, (height // cells, width // cells)) * (height * width)
-        agreement = torch.einsum("bnc,knc->bkn", shares.flatten(2), self.places.flatten(2))
-        return self.trust * (agreement + OPEN_MIND).log().sum(dim=2)
+        shares = functional.avg_pool2d(belief, (height // self.cells, width // self.cells)) * (height * width)
+        agreement = shares.flatten(2).transpose(0, 1) @ self.places  # (n, b, k)
+        return self.trust * (agreement + OPEN_MIND).log().sum(dim=0)
