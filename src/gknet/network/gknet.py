@@ -133,10 +133,10 @@ class GKNet(HeatmapNetwork):
         nodes = self._node_maps(self.decoder(memory, glance), places)
         first = pixels + nodes
         attitude = self._agreed(attitude, first)
-        pixels = self._expected(alone, attitude)
-        found = self._convinced(pixels + nodes, hints) @ seen
+        settled = self._expected(alone, attitude)
+        found = self._convinced(settled + nodes, hints) @ seen
         nodes = self._node_maps(self.decoder(memory, lambda nodes: found), places)
-        return Branches(self.fusion(pixels, nodes), pixels, nodes, first, attitude)
+        return Branches(self.fusion(settled, nodes), settled, nodes, first, attitude)
 
     def _expected(self, maps: Float[Tensor, "b n h w"], attitude: Float[Tensor, "b k"] | None) -> Tensor:
         """Maps (b, n, h, w) with what the attitude says of each keypoint's place (decision 0016)."""
