@@ -208,6 +208,18 @@ def test_pixels_that_are_not_square_are_refused_to_a_direct_network_alone() -> N
     check_cameras(build("gknet-s", CRAFT.adjacency, CRAFT.points_m), Frames())
 
 
+def test_pixels_that_are_not_square_leave_the_attitude_unknown() -> None:
+    """A turned picture of them is of no pose, so nothing is to be learnt of it; the keypoints turn all the same."""
+    frame = a_frame(0)
+    wide = Camera(frame.camera.matrix * np.array([[1.1], [1], [1]]), 512, 512)
+    square, stretched = (cached_row(replace(frame, camera=each), CRAFT, "craft", 96) for each in (frame.camera, wide))
+    assert square is not None
+    assert stretched is not None
+    assert np.isfinite(square.pose).all()
+    assert np.isnan(stretched.pose).all()
+    assert np.isfinite(stretched.points_px).all()
+
+
 def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     """The loaded estimator answers as the trained weights do, in the oracle's crop of a validation frame."""
     assert {path.name for path in model.iterdir()} == {"direct.onnx", "direct.safetensors"}
