@@ -30,7 +30,7 @@ class AttitudePrior(nn.Module):
 
     A keypoint by itself may be in two minds about twin places; an attitude puts all keypoints on one side.
 
-    places   (k, n, cells, cells), `gknet.attitude.AttitudeBins.places`
+    places   given as (k, n, cells, cells), `gknet.attitude.AttitudeBins.places`; kept as (n, cells cells, k)
     gain     of what the attitude says, learnt; trust in what keypoints say, likewise: they err alike, so below 1
     """
 

@@ -82,7 +82,10 @@ def load_checkpoint(
         ValueError,
         RuntimeError,
     ) as error:  # a part is missing or of another kind
-        raise GknetError(f"{path}: it does not fit this training ({error!r})") from error
+        first = (str(error).splitlines() or [""])[0]
+        raise GknetError(
+            f"{path}: it does not fit this training ({type(error).__name__}: {first}); train anew in another folder"
+        ) from error
 
 
 def save_weights(path: Path, weights: Mapping[str, Tensor], metadata: Mapping[str, object]) -> None:

@@ -189,7 +189,7 @@ def export_run(folder: Path, out: Path, tolerance: float = TOLERANCE) -> Exporte
         network.load_state_dict(weights)
     except RuntimeError as error:
         raise GknetError(
-            f"{folder / BEST}: it is not of the network in run.json ({str(error).splitlines()[0]})"
+            f"{folder / BEST}: it is not of the network in run.json, as this version builds it; train it anew"
         ) from error
     network.eval()
     small = folded(network)
