@@ -76,7 +76,7 @@ def keypoint_stages(
     keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
     box = Box.around(true_px) if trust_box else None
     views = np.repeat(given, estimator.looking.turns, axis=0)
-    heatmaps = estimator.keypoint_network(given)[0]
+    heatmaps = estimator.keypoint_network(given).heatmaps[0]
     stride = crop.size / heatmaps.shape[2]
     return {
         "keypoint network": median_ms(lambda: estimator.keypoint_network(views), runs),

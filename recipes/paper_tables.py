@@ -291,8 +291,8 @@ def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -
     if isinstance(estimator, DirectEstimator):
         network = estimator.network
     else:
-        network = estimator.keypoint_network
-        paper = PaperEstimator(network, estimator.spacecraft, size)
+        network = OnnxNetwork(model / "keypoints.onnx")
+        paper = PaperEstimator(network.seen, estimator.spacecraft, size)
         runs["paper"] = evaluate(dataset, paper, ("oracle",)).runs[0]
     return {
         "name": method.name,

@@ -53,7 +53,7 @@ SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Of the later weights in the mean with those that a run began with."""
 FIRST = "first"
 FIRST_STAGES = (Stage(0.55, 128, 16), Stage(0.25, 192, 16), Stage(0.20, 256, 16))
-KEYPOINT_STAGES = (Stage(0.5, 128, 16), Stage(0.5, 192, 16))
+KEYPOINT_STAGES = (Stage(1.0, 192, 16),)
 FULL_STAGES = (Stage(0.4, 128, 32), Stage(0.2, 192, 32), Stage(0.4, 256, 32))
 
 

@@ -63,6 +63,17 @@ def test_of_two_twins_half_a_turn_apart_the_likelier_is_taken_whole() -> None:
     assert Pose.from_quaternion(BINS.attitude_wxyz(belief), np.zeros(3)).angle_to(one) < math.radians(2)
 
 
+def test_the_share_near_an_attitude_is_what_is_believed_of_it() -> None:
+    one = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], np.zeros(3)).quaternion_wxyz
+    twin = (Pose.from_quaternion(one, np.zeros(3)) @ HALF_TURN).quaternion_wxyz
+    belief = 0.6 * BINS.soft_label(one) + 0.4 * BINS.soft_label(twin)
+    for attitude, share in ((one, 0.6), (-one, 0.6), (twin, 0.4)):
+        assert BINS.share_near(belief, attitude, math.radians(60)) == pytest.approx(share, abs=0.01)
+    everything = np.full(BINS.count, 1 / BINS.count)
+    assert BINS.share_near(everything, one, math.pi) == pytest.approx(1)
+    assert BINS.share_near(everything, one, math.radians(60)) < 0.15
+
+
 @pytest.mark.parametrize("chosen", [0, 300, 777, 1500, 2047])
 def test_an_attitude_puts_keypoints_where_a_camera_far_away_sees_them(chosen: int) -> None:
     """Anywhere in the picture, in the crop about them."""

@@ -14,7 +14,7 @@ from gknet.errors import GknetError
 from gknet.estimator import Estimator
 from gknet.frame import Frame, Keypoints
 from gknet.geometry import Camera, Pose
-from gknet.locate import Looking
+from gknet.locate import Looking, Seen
 from gknet.metrics import nees
 from gknet.spacecraft import Spacecraft
 
@@ -67,7 +67,7 @@ def median_nees(estimator: Estimator, seen: list[Sight]) -> float:
 @pytest.mark.parametrize("common_px", [0.0, 8.0])
 def test_a_calibrated_covariance_fits_on_other_frames(common_px: float) -> None:
     rng = np.random.default_rng(1)
-    bare = Estimator(lambda images: images, CRAFT, looking=Looking(input_size=192), decoding=BARE)
+    bare = Estimator(Seen, CRAFT, looking=Looking(input_size=192), decoding=BARE)
     estimator = calibrated(bare, sights(common_px, 1.0, rng))
     assert (estimator.pnp.covariance_scale > 1.5) == (common_px > 0)
     assert median_nees(estimator, sights(common_px, 1.0, rng)) == pytest.approx(5.35, rel=0.3)
@@ -77,7 +77,7 @@ def test_a_calibrated_covariance_fits_on_other_frames(common_px: float) -> None:
 
 
 def test_too_few_keypoints_are_refused() -> None:
-    bare = Estimator(lambda images: images, CRAFT, decoding=BARE)
+    bare = Estimator(Seen, CRAFT, decoding=BARE)
     with pytest.raises(GknetError, match="at least 30"):
         calibrated(bare, sights(0, 1.0, np.random.default_rng(2), count=2))
 
@@ -89,11 +89,11 @@ def test_a_sight_decodes_as_the_estimator_does() -> None:
     y, x = np.mgrid[:48, :48] + 0.5
     squared = (x - cells[:, :1, None]) ** 2 + (y - cells[:, 1:, None]) ** 2
     heatmaps = (0.7 * np.exp(-squared / (2 * 1.5**2))).astype(np.float32)[None]
-    bare = Estimator(lambda images: heatmaps, CRAFT, looking=Looking(input_size=192), decoding=BARE)
+    bare = Estimator(lambda images: Seen(heatmaps), CRAFT, looking=Looking(input_size=192), decoding=BARE)
     seen = sight(frame, bare, STRIDE)
     assert frame.image is not None
     assert seen.frame.image is None
     wanted = replace(bare, decoding=replace(BARE, floor_cells=0.4, spread_scale=0.6))
     np.testing.assert_allclose(
-        seen.decoded(wanted.decoding).covariance_px2, wanted.detect(frame.image, seen.crop).covariance_px2, rtol=1e-4
+        seen.decoded(wanted.decoding).covariance_px2, wanted.detect(frame.image, seen.crop)[0].covariance_px2, rtol=1e-4
     )

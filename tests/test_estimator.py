@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +11,15 @@ import numpy as np
 import pytest
 
 import gknet.estimator as estimating
+from gknet.attitude import AttitudeBins
 from gknet.crop import Crop
 from gknet.decode import Decoding
+from gknet.direct import attitude_seen
 from gknet.errors import GknetError
 from gknet.estimator import Estimator, load_estimator, shipped_models
 from gknet.frame import Box, Frame
 from gknet.geometry import Camera, Pose
-from gknet.locate import Looking, check_image
+from gknet.locate import Looking, Seen, check_image
 from gknet.metrics import errors
 from gknet.pnp import PnpResult, PnpSettings
 from gknet.spacecraft import Spacecraft, spacecraft_toml
@@ -71,8 +74,8 @@ class PerfectNetwork:
         scale, offset = self.chart.read(images[0])
         return self.true_px * scale + offset
 
-    def __call__(self, images: np.ndarray) -> np.ndarray:
-        return gaussians(self.seen(images) / 4)[None]
+    def __call__(self, images: np.ndarray) -> Seen:
+        return Seen(gaussians(self.seen(images) / 4)[None])
 
 
 class PerfectLocator(PerfectNetwork):
@@ -124,15 +127,15 @@ def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
     image = np.repeat((230 * dot).astype(np.uint8)[:, :, None], 3, axis=2)
     batches = []
 
-    def network(images: np.ndarray) -> np.ndarray:
+    def network(images: np.ndarray) -> Seen:
         batches.append(len(images))
         maps = images[:, :1].reshape(len(images), 1, 64, 4, 64, 4).mean(axis=(3, 5))
         maps[:, :, 5, 7] = 1
-        return np.repeat(maps, 14, axis=1).astype(np.float32)
+        return Seen(np.repeat(maps, 14, axis=1).astype(np.float32))
 
     for turns, place in ((1, (30, 22)), (2, (170, 80)), (4, (170, 80))):
         estimator = Estimator(network, CRAFT, looking=Looking(turns=turns))
-        found = estimator.detect(image, Crop(0, 0, 256, 256))
+        found, _ = estimator.detect(image, Crop(0, 0, 256, 256))
         np.testing.assert_allclose(found.pixels, [place] * 14, atol=0.2)
         assert found.score.min() > 0.7  # every view says so
     assert batches == [1, 2, 4]
@@ -214,10 +217,28 @@ def test_same_image_same_estimate() -> None:
     assert np.array_equal(first.covariance, second.covariance)
 
 
+def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
+    """Of a twin's attitude, half a turn away about the line of sight, it is told to doubt the pose."""
+    bins, pose = AttitudeBins(12), POSES["beyond the border"]
+    estimator, frame = perfect(pose)
+    box = frame.true_box(POINTS)
+    see = estimator.keypoint_network
+    assert estimator.estimate(frame.image, CAMERA, box).attitude_belief is None
+    twin = pose @ Pose.from_rotation_vector([0, 0, math.pi], [0, 0, 0])
+    for believed, low, high in ((pose, 0.95, 1.0), (twin, 0.0, 0.05)):
+        label = bins.soft_label(attitude_seen(believed))[None].astype(np.float32)
+        sure = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=label), bins=bins)  # noqa: B023
+        estimate = sure.estimate(frame.image, CAMERA, box)
+        assert estimate.cam_from_body is not None
+        assert estimate.cam_from_body.angle_to(pose) < 0.01
+        assert estimate.attitude_belief is not None
+        assert low <= estimate.attitude_belief <= high
+
+
 def test_failures_are_values_with_reasons() -> None:
     estimator, frame = perfect(POSES["middle"])
     assert estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50)).failure == "the box lies outside the image"
-    blind = Estimator(lambda images: np.zeros((1, 14, 64, 64), dtype=np.float32), CRAFT)
+    blind = Estimator(lambda images: Seen(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
     estimate = blind.estimate(frame.image, CAMERA, frame.true_box(POINTS))
     assert estimate.failure is not None
     assert "0 keypoints" in estimate.failure
@@ -248,8 +269,8 @@ def test_thresholds_are_in_pixels_of_the_input() -> None:
     network = estimator.keypoint_network
     jitter = np.random.default_rng(1).normal(0, 2.0, POINTS.shape[:1] + (2,))
 
-    def jittered(images: np.ndarray) -> np.ndarray:
-        return gaussians((network.seen(images) + jitter) / 4)[None]
+    def jittered(images: np.ndarray) -> Seen:
+        return Seen(gaussians((network.seen(images) + jitter) / 4)[None])
 
     strict = PnpSettings(threshold_px=(6.0,), min_inlier_fraction=0.9)
     estimate = Estimator(jittered, CRAFT, pnp=strict).estimate(frame.image, CAMERA, frame.true_box(POINTS))
@@ -266,7 +287,7 @@ def test_the_locator_sees_the_whole_frame_in_the_middle() -> None:
         return np.zeros((1, 5, 64, 64), dtype=np.float32)
 
     image = np.full((100, 200, 3), 255, dtype=np.uint8)
-    assert Estimator(locator, CRAFT, locator).locate(image) is None
+    assert Estimator(Seen, CRAFT, locator).locate(image) is None
     lit = views[0][0] > 0.5
     assert lit[64:192].all()
     assert not lit[:64].any()
@@ -300,7 +321,7 @@ def test_bad_use_is_refused() -> None:
         estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
     with pytest.raises(GknetError, match="give a box"):
         Estimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
-    wrong = Estimator(lambda images: np.zeros((1, 3, 64, 64), dtype=np.float32), CRAFT)
+    wrong = Estimator(lambda images: Seen(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
     with pytest.raises(GknetError, match="14 heatmaps"):
         wrong.estimate(frame.image, CAMERA, frame.true_box(POINTS))
 

@@ -157,6 +157,7 @@ def many(sequences: int, frames: int, seed: int) -> list[FrameErrors]:
             reason = f"only {k} points" if k % 10 == 9 else None
             rmse = level + generator.normal(0, 0.5)
             known = {"rmse_px": rmse, "e_t": e_t, "failure": reason, "earth_in_view": float(s % 3 == 0)}
+            known["attitude_belief"] = None if reason else 0.3 if s == 0 else 0.9
             found.append(replace(one, name=f"{s}/{k}", sequence=str(s), **known))
     return found
 
@@ -171,6 +172,7 @@ def test_summary_counts_everything() -> None:
         assert sum(b.frames for b in summary.bins if b.by == by) == 120
         assert sum(b.failures for b in summary.bins if b.by == by) == 12
     assert [b.frames for b in summary.bins if b.by == "earth_in_view"] == [80, 40]
+    assert [(b.low, b.frames) for b in summary.bins if b.by == "attitude_belief"] == [(0.0, 18), (0.8, 90)]
     assert summary.located_07 == 1.0
     assert summary.coverage_95 == 1.0
 

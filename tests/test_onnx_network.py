@@ -58,6 +58,9 @@ def test_runs_and_tells_what_it_is(tmp_path: Path) -> None:
         ("{", "JSON"),
         (json.dumps(METADATA | {"stride": 0}), "stride"),
         (json.dumps(METADATA | {"kind": "cat"}), "kind"),
+        (json.dumps(METADATA | {"kind": "locator", "bins": 12}), "no bins for a locator"),
+        (json.dumps(METADATA | {"kind": "direct", "bins": 12}), "bins for a direct network"),
+        (json.dumps(METADATA | {"bins": 12}), "expected 2 outputs by its metadata, got 1"),
         (json.dumps({k: v for k, v in METADATA.items() if k != "spacecraft"}), "spacecraft"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 from gknet.errors import GknetError
 from gknet.frame import Box
 from gknet.geometry import Camera, Pose
+from gknet.locate import Seen
 from gknet.metrics import pose_errors
 from gknet.paper_protocol import PaperEstimator, highest_cells, plain_pnp
 from gknet.spacecraft import Spacecraft
@@ -40,12 +41,12 @@ def test_plain_pnp_is_exact_on_exact_points_and_has_no_defence() -> None:
 def test_the_estimate_comes_from_the_given_crop() -> None:
     box = Box.around(CAMERA.project(POSE.transform(POINTS)))
 
-    def network(images: np.ndarray) -> np.ndarray:
+    def network(images: np.ndarray) -> Seen:
         side = round(box.side * 1.25)
         corner = np.array([round(c - side / 2) for c in box.centre])
         inside = (CAMERA.project(POSE.transform(POINTS)) - corner) * 256 / side
         y, x = (np.mgrid[:64, :64] + 0.5) * 4
-        return np.exp(-((x - inside[:, :1, None]) ** 2 + (y - inside[:, 1:, None]) ** 2) / 72)[None]
+        return Seen(np.exp(-((x - inside[:, :1, None]) ** 2 + (y - inside[:, 1:, None]) ** 2) / 72)[None])
 
     estimator = PaperEstimator(network, CRAFT)
     image = np.zeros((640, 800, 3), np.uint8)

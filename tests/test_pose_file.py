@@ -19,7 +19,9 @@ def estimate() -> Estimate:
     keypoints = Keypoints(np.array([[1.5, 2.5], [np.nan, 4]]), np.array([0.9, 0.1]), np.tile(np.eye(2), (2, 1, 1)))
     covariance = np.arange(36.0).reshape(6, 6)
     pose = Pose.from_rotation_vector([0.1, 0.2, 0.3], [1, 2, 30])
-    return Estimate(keypoints, pose, covariance + covariance.T, np.array([True, False]), 0.5, Box(0, 1, 2, 3))
+    return Estimate(
+        keypoints, pose, covariance + covariance.T, np.array([True, False]), 0.5, Box(0, 1, 2, 3), attitude_belief=0.75
+    )
 
 
 def test_record_holds_the_estimate() -> None:
@@ -36,6 +38,7 @@ def test_record_holds_the_estimate() -> None:
         "inlier": True,
     }
     assert entry["keypoints"][1]["pixel"] == [None, 4]
+    assert entry["attitude_belief"] == 0.75
     assert (entry["inlier_count"], entry["reprojection_rms_px"], entry["box"]) == (1, 0.5, [0, 1, 2, 3])
 
 

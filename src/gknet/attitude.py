@@ -89,6 +89,10 @@ class AttitudeBins:
     def _mean(self, belief: Float[ndarray, "k"]) -> Rotation:
         return rotation_of(np.linalg.eigh((belief @ self._moments).reshape(4, 4))[1][:, -1])
 
+    def share_near(self, belief: Float[ndarray, "k"], attitude_wxyz: Float[ndarray, "4"], angle_rad: float) -> float:
+        """How much of a belief lies in cells whose centres are within an angle of an attitude."""
+        return float(belief[np.abs(self.centres_wxyz @ attitude_wxyz) >= np.cos(angle_rad / 2)].sum())
+
     def places(self, points_m: Float[ndarray, "n 3"], cells: int) -> Float[ndarray, "k n cells cells"]:
         """Where each attitude puts each keypoint in a crop of `cells` x `cells`: shares of 1, row by row.
 

@@ -31,6 +31,9 @@ from gknet.spacecraft import Spacecraft
 SQUARE = 0.01
 """How far fx / fy may be from 1 where pictures are turned."""
 
+NEAR_RAD = math.radians(60)
+"""Attitudes nearer than this are alike; twins are half or a quarter of a turn apart."""
+
 FARTHEST = 10.0
 """A logarithm of the depth beyond this is no answer; it is cut off, and the pose is refused for its size."""
 
@@ -54,9 +57,8 @@ class CropPose:
         if not np.isfinite(pixel).all():
             return None
         size_m = pose.translation_m[2] * crop.side / focal_px(camera)  # of what fills the crop at that depth
-        attitude = Pose(least_turn(pose.translation_m).T @ pose.rotation, np.zeros(3))
         offset = crop.to_input(pixel) / crop.size - 0.5
-        return CropPose(offset, math.log(size_m / diameter_m), attitude.quaternion_wxyz)
+        return CropPose(offset, math.log(size_m / diameter_m), attitude_seen(pose))
 
     def pose(self, camera: Camera, crop: Crop, diameter_m: float) -> Pose:
         """The pose that the crop shows: the inverse of `of`."""
@@ -101,6 +103,18 @@ def least_turn(ray: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
     return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
+def attitude_seen(pose: Pose) -> Float[ndarray, "4"]:
+    """R_ray^T R of a pose in front of the camera, as a quaternion (w, x, y, z)."""
+    return Pose(least_turn(pose.translation_m).T @ pose.rotation, np.zeros(3)).quaternion_wxyz
+
+
+def belief_in(pose: Pose, belief: Float[ndarray, "k"] | None, bins: AttitudeBins | None) -> float | None:
+    """How much of a belief in the attitude lies about a pose's; None without either."""
+    if belief is None or bins is None:
+        return None
+    return bins.share_near(belief, attitude_seen(pose), NEAR_RAD)
+
+
 def decode_output(output: Float[ndarray, "c"], bins: AttitudeBins) -> CropPose | None:
     """A direct network's row: offset x and y, log_depth, then the belief in each cell. None when it is not finite."""
     if output.shape != (3 + bins.count,):
@@ -128,7 +142,8 @@ class DirectEstimator(CropEstimator):
     def estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box) -> Estimate:
         """A pose without a covariance. Its keypoints are where it puts the spacecraft's points: none was detected."""
         crop = Crop.around(box, self.looking.input_size)
-        seen = decode_output(self.network(network_input(image, crop))[0], self.bins)
+        output = self.network(network_input(image, crop))[0]
+        seen = decode_output(output, self.bins)
         if seen is None:
             return Estimate(box=box, failure="the network's answer is not finite")
         pose = seen.pose(camera, crop, self.spacecraft.diameter_m)
@@ -138,4 +153,4 @@ class DirectEstimator(CropEstimator):
         pixels = camera.project(pose.transform(self.spacecraft.points_m))
         count = len(pixels)
         keypoints = Keypoints(pixels, np.ones(count), np.tile(np.eye(2) / crop.scale**2, (count, 1, 1)))
-        return Estimate(keypoints, pose, box=box)
+        return Estimate(keypoints, pose, box=box, attitude_belief=belief_in(pose, output[3:], self.bins))

@@ -14,11 +14,11 @@ from numpy import ndarray
 from gknet.attitude import AttitudeBins
 from gknet.crop import Crop
 from gknet.decode import Decoding, decode_heatmaps, keypoints_to_image
-from gknet.direct import DirectEstimator
+from gknet.direct import DirectEstimator, belief_in
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera
-from gknet.locate import CropEstimator, Looking, Network, network_input
+from gknet.locate import CropEstimator, KeypointNetwork, Looking, Network, network_input
 from gknet.onnx_network import OnnxNetwork
 from gknet.pnp import PnpResult, PnpSettings, solve_pnp
 from gknet.spacecraft import Spacecraft
@@ -31,46 +31,64 @@ SURE_SCORE = 0.3
 class Estimator(CropEstimator):
     """Finds one known spacecraft by its keypoints.
 
-    keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride), channel k is keypoint k
+    keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride), channel k is keypoint k, and perhaps a
+                       belief in the attitude
+    bins               the classes of that belief; None where there is none
     """
 
-    keypoint_network: Network
+    keypoint_network: KeypointNetwork
     spacecraft: Spacecraft
     locator: Network | None = None
     looking: Looking = field(default_factory=Looking)
     decoding: Decoding = field(default_factory=Decoding)
     pnp: PnpSettings = field(default_factory=PnpSettings)
+    bins: AttitudeBins | None = None
 
     def estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box) -> Estimate:
         crop = Crop.around(box, self.looking.input_size)
-        first = self.pose_of(self.detect(image, crop), camera, box, crop)
+        first = self.pose_of(*self.detect(image, crop), camera, box, crop)
         better_crop = self._better_crop(first, camera, crop)
         if better_crop is None:
             return first
-        second = self.pose_of(self.detect(image, better_crop), camera, box, better_crop, trust_box=False)
+        second = self.pose_of(*self.detect(image, better_crop), camera, box, better_crop, trust_box=False)
         return second if _support(second) >= _support(first) else first
 
-    def detect(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> Keypoints:
-        """The keypoints seen in a crop, in pixels of the full image."""
-        heatmaps = self._heatmaps(network_input(image, crop))
+    def detect(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> tuple[Keypoints, Float32[ndarray, "k"] | None]:
+        """The keypoints seen in a crop, in pixels of the full image, and the belief in the attitude if there is one."""
+        heatmaps, attitude = self._seen(network_input(image, crop))
         if len(heatmaps) != self.spacecraft.keypoint_count:
             raise GknetError(
                 f"keypoint network: expected {self.spacecraft.keypoint_count} heatmaps for {self.spacecraft.name}, "
                 f"got {len(heatmaps)}"
             )
         keypoints = decode_heatmaps(heatmaps, crop.size / heatmaps.shape[2], self.decoding)
-        return keypoints_to_image(keypoints, crop)
+        return keypoints_to_image(keypoints, crop), attitude
 
-    def _heatmaps(self, upright: Float32[ndarray, "1 3 s s"]) -> Float32[ndarray, "n hs ws"]:
-        """The mean over quarter turns of the crop, each turned back: what errs in one of them is outvoted."""
+    def _seen(
+        self, upright: Float32[ndarray, "1 3 s s"]
+    ) -> tuple[Float32[ndarray, "n hs ws"], Float32[ndarray, "k"] | None]:
+        """Heatmaps, the mean over quarter turns of the crop, each turned back: what errs in one of them is outvoted.
+
+        The belief in the attitude is that of the upright crop.
+        """
         turns = range(0, 4, 4 // self.looking.turns)
         views = np.concatenate([np.rot90(upright, turn, (2, 3)) for turn in turns])
         seen = self.keypoint_network(views)
-        return np.mean([np.rot90(maps, -turn, (1, 2)) for maps, turn in zip(seen, turns, strict=True)], axis=0)
+        turned_back = [np.rot90(maps, -turn, (1, 2)) for maps, turn in zip(seen.heatmaps, turns, strict=True)]
+        return np.mean(turned_back, axis=0), None if seen.attitude is None else seen.attitude[0]
 
-    def pose_of(self, keypoints: Keypoints, camera: Camera, box: Box, crop: Crop, trust_box: bool = True) -> Estimate:
+    def pose_of(
+        self,
+        keypoints: Keypoints,
+        attitude: Float32[ndarray, "k"] | None,
+        camera: Camera,
+        box: Box,
+        crop: Crop,
+        trust_box: bool = True,
+    ) -> Estimate:
         """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none.
 
+        attitude    the belief in it
         trust_box   whether the box has a say; not one that the keypoints contradicted
         """
         measured = box if trust_box else None
@@ -81,7 +99,13 @@ class Estimator(CropEstimator):
         if contradiction is not None:
             return Estimate(keypoints, box=box, failure=contradiction)
         return Estimate(
-            keypoints, result.cam_from_body, result.covariance, result.inliers, result.reprojection_rms_px, box
+            keypoints,
+            result.cam_from_body,
+            result.covariance,
+            result.inliers,
+            result.reprojection_rms_px,
+            box,
+            attitude_belief=belief_in(result.cam_from_body, attitude, self.bins),
         )
 
     def _better_crop(self, estimate: Estimate, camera: Camera, crop: Crop) -> Crop | None:
@@ -152,17 +176,20 @@ def load_estimator(
     about = network.metadata
     locator_size = locator.metadata.input_size if locator else Looking.locator_size
     looking = Looking(about.input_size, locator_size, turns=turns)
-    if about.bins is not None:
+    bins = None if about.bins is None else AttitudeBins(about.bins)
+    if kinds[0] == "direct":
+        assert bins is not None  # by its metadata
         if turns > 1:
             raise GknetError(f"turns: only a keypoint network sees a crop in several orientations, got {turns}")
-        return DirectEstimator(network, network.spacecraft, AttitudeBins(about.bins), locator, looking)
+        return DirectEstimator(network, network.spacecraft, bins, locator, looking)
     return Estimator(
-        network,
+        network.seen,
         network.spacecraft,
         locator,
         looking,
         Decoding(about.floor_cells, about.spread_scale),
         PnpSettings(covariance_scale=about.pose_scale),
+        bins,
     )
 
 

@@ -131,6 +131,9 @@ class Estimate:
                  R_true = exp([dw]x) R, t_true = t + dt
     inliers      (n,) bool: keypoints that the pose agrees with
     box          where the spacecraft was looked for, in pixels of the image
+    attitude_belief   0 to 1: the network's belief in attitudes within 60 degrees of the pose's. The rest of it is in
+                 others: below a half the pose may well be that of a twin, whatever the covariance says. None of a
+                 network that has no such belief
     """
 
     keypoints: Keypoints | None = None
@@ -140,6 +143,7 @@ class Estimate:
     reprojection_rms_px: float | None = None
     box: Box | None = None
     failure: str | None = None
+    attitude_belief: float | None = None
 
     def __post_init__(self) -> None:
         if (self.cam_from_body is None) != (self.failure is not None):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -19,6 +20,19 @@ from gknet.spacecraft import Spacecraft
 
 Network = Callable[[Float32[ndarray, "b 3 size size"]], Float32[ndarray, "b c *cells"]]
 
+
+class Seen(NamedTuple):
+    """What a keypoint network answers.
+
+    heatmaps   (b, n, h, w), channel k is keypoint k
+    attitude   (b, k) shares of 1: its belief in each class of attitude (attitude.py); None of one that has none
+    """
+
+    heatmaps: Float32[ndarray, "b n h w"]
+    attitude: Float32[ndarray, "b k"] | None = None
+
+
+KeypointNetwork = Callable[[Float32[ndarray, "b 3 size size"]], Seen]
 
 PLAUSIBLE_SIZE = (0.25, 6.0)
 """Projected diameter of the craft over the crop's side: less when it is seen end-on, more when it is cut off."""

@@ -36,6 +36,7 @@ RANGE_EDGES_DIAMETERS = (0.0, 1.5, 2.5, 4.0, 7.0, 12.0, np.inf)
 PHASE_EDGES_DEG = (0.0, 30.0, 60.0, 90.0, 120.0, 180.0)
 VISIBLE_EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 1.0)
 EARTH_EDGES = (0.0, 0.5, 1.0)
+BELIEF_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class FrameErrors:
     nees               squared pose error over the covariance: 6 in the mean when the covariance is right
     visible_fraction   keypoints in view and not hidden, over all
     earth_in_view      1 with a part of the Earth in the picture, 0 without
+    attitude_belief    of the estimate; None without a pose, or of a network that has none
     """
 
     name: str
@@ -73,6 +75,7 @@ class FrameErrors:
     phase_angle_rad: float | None
     visible_fraction: float | None
     earth_in_view: float | None
+    attitude_belief: float | None
 
 
 def oracle_crop(frame: Frame, spacecraft: Spacecraft, size: int = ORACLE_SIZE) -> Crop:
@@ -125,6 +128,7 @@ def errors(
         phase_angle_rad=frame.phase_angle_rad,
         visible_fraction=None if frame.visible is None else float((frame.visible & in_view).mean()),
         earth_in_view=None if frame.earth_in_view is None else float(frame.earth_in_view),
+        attitude_belief=estimate.attitude_belief,
     )
 
 
@@ -242,7 +246,7 @@ class Summary:
 
 
 def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int = 1000) -> Summary:
-    """Means, medians and 95 % intervals of every metric: overall, by range, phase angle, visibility and background."""
+    """Means, medians and 95 % intervals of every metric: overall, and by what the bins are of."""
     if not frame_errors:
         raise GknetError("summary: expected at least one frame, got none")
     squared = np.array([e.nees for e in frame_errors if e.nees is not None])
@@ -306,6 +310,7 @@ def _bins(frame_errors: Sequence[FrameErrors], seed: int, resamples: int) -> lis
         ("phase_angle_rad", phase),
         ("visible_fraction", VISIBLE_EDGES),
         ("earth_in_view", EARTH_EDGES),
+        ("attitude_belief", BELIEF_EDGES),
     ):
         values = np.array([np.nan if (v := getattr(e, by)) is None else v for e in frame_errors], dtype=np.float64)
         for low, high in pairwise(edges):

@@ -13,6 +13,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from gknet.errors import GknetError
+from gknet.locate import Seen
 from gknet.spacecraft import Spacecraft, spacecraft_from_toml
 
 METADATA_KEY = "gknet"
@@ -25,7 +26,8 @@ class Metadata(BaseModel):
 
     spacecraft        the text of the spacecraft's .toml: channel k of a keypoint network is its keypoint k
     stride            input pixels per cell of the output's maps; a direct network has none
-    bins              of a direct network's attitude, each turn (direct.py)
+    bins              cells to a turn of the attitude (attitude.py) of a direct network, or of one that sees keypoints
+                      and has a belief in it
     tolerance         the largest difference from the trained network that the export allowed
     floor_cells, spread_scale, pose_scale   how sure keypoints and poses are (calibration.py), from the validation split
     """
@@ -44,15 +46,25 @@ class Metadata(BaseModel):
     spread_scale: FiniteFloat = Field(default=1.0, gt=0)
     pose_scale: FiniteFloat = Field(default=1.0, gt=0)
 
+    @property
+    def outputs(self) -> int:
+        """A keypoint network's belief in the attitude is an output of its own."""
+        return 2 if self.kind == "keypoints" and self.bins is not None else 1
+
     @model_validator(mode="after")
     def _output_is_known(self) -> Metadata:
-        if (self.kind == "direct") != (self.bins is not None) or (self.kind == "direct") == (self.stride is not None):
+        direct = self.kind == "direct"
+        if direct == (self.stride is not None) or (direct and self.bins is None):
             raise ValueError("expected a stride for maps, or bins for a direct network")
+        if self.kind == "locator" and self.bins is not None:
+            raise ValueError("expected no bins for a locator")
         return self
 
 
 class OnnxNetwork:
     """A callable (b, 3, size, size) float32 RGB in [0, 1] -> (b, c, size / stride, size / stride), or (b, c) if direct.
+
+    `seen` is the same for the estimator by keypoints, with the belief in the attitude.
 
     threads   of one call; None leaves the choice to onnxruntime (every core)
     device    "cpu", or "cuda" with the package onnxruntime-gpu
@@ -64,19 +76,29 @@ class OnnxNetwork:
         self._input = self._session.get_inputs()[0].name
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
         self.metadata = _read_metadata(self.path, text)
+        outputs = len(self._session.get_outputs())
+        if outputs != self.metadata.outputs:
+            raise GknetError(f"{self.path}: expected {self.metadata.outputs} outputs by its metadata, got {outputs}")
 
     @cached_property
     def spacecraft(self) -> Spacecraft:
         return spacecraft_from_toml(self.metadata.spacecraft, str(self.path))
 
     def __call__(self, images: Float32[ndarray, "b 3 size size"]) -> Float32[ndarray, "b c *cells"]:
+        return self._run(images)[0]
+
+    def seen(self, images: Float32[ndarray, "b 3 size size"]) -> Seen:
+        """Of a keypoint network: its belief in the attitude too, where it has one."""
+        return Seen(*self._run(images))
+
+    def _run(self, images: Float32[ndarray, "b 3 size size"]) -> list[ndarray]:
         size = self.metadata.input_size
         if images.ndim != 4 or images.shape[1:] != (3, size, size) or images.dtype != np.float32:
             raise GknetError(
                 f"{self.path.name}: expected float32 images of shape (b, 3, {size}, {size}), "
                 f"got {images.dtype} of {images.shape}"
             )
-        return self._session.run(None, {self._input: images})[0]
+        return self._session.run(None, {self._input: images})
 
 
 def _open(path: Path, threads: int | None, device: str) -> onnxruntime.InferenceSession:

@@ -16,7 +16,7 @@ from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera, Pose
-from gknet.locate import Network, check_image, network_input
+from gknet.locate import KeypointNetwork, check_image, network_input
 from gknet.spacecraft import Spacecraft
 
 STRIDE = 8
@@ -30,7 +30,7 @@ class PaperEstimator:
     keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride)
     """
 
-    keypoint_network: Network
+    keypoint_network: KeypointNetwork
     spacecraft: Spacecraft
     input_size: int = 256
 
@@ -39,7 +39,7 @@ class PaperEstimator:
         if box is None:
             raise GknetError("the paper's protocol: expected the box of the true keypoints, got none")
         crop = Crop.around(box, self.input_size)
-        heatmaps = self.keypoint_network(network_input(check_image(image), crop))[0]
+        heatmaps = self.keypoint_network(network_input(check_image(image), crop)).heatmaps[0]
         pixels = crop.to_image(highest_cells(heatmaps, self.input_size))
         count = len(pixels)
         keypoints = Keypoints(pixels, np.ones(count), np.tile(np.eye(2) / crop.scale**2, (count, 1, 1)))

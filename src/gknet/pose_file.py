@@ -42,6 +42,7 @@ def record(name: str, time_s: float | None, estimate: Estimate, keypoint_names: 
         "translation_m": _plain(pose.translation_m) if pose else None,
         "quaternion_wxyz": _plain(pose.quaternion_wxyz) if pose else None,
         "covariance": _plain(estimate.covariance),
+        "attitude_belief": _plain(estimate.attitude_belief),
         "reprojection_rms_px": _plain(estimate.reprojection_rms_px),
         "inlier_count": int(estimate.inliers.sum()) if estimate.inliers is not None else None,
         "box": _plain(np.array([box.x0, box.y0, box.x1, box.y1])) if box else None,
@@ -116,7 +117,7 @@ class PoseWriter:
 def csv_columns(keypoint_names: Sequence[str]) -> list[str]:
     """Covariance is its upper triangle, row by row, of (rotation vector, translation)."""
     columns = ["name", "time_s", "status", "failure", "tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"]
-    columns += ["reprojection_rms_px", "inlier_count", "box_x0", "box_y0", "box_x1", "box_y1"]
+    columns += ["attitude_belief", "reprojection_rms_px", "inlier_count", "box_x0", "box_y0", "box_x1", "box_y1"]
     columns += [f"covariance_{i}{j}" for i, j in _COVARIANCE_CELLS]
     return columns + [f"{name}_{what}" for name in keypoint_names for what in ("x", "y", "score")]
 
@@ -131,7 +132,7 @@ def csv_row(entry: dict[str, object], keypoint_names: Sequence[str]) -> list[obj
     covariance = entry.get("covariance")
     row: list[object] = [entry["name"], entry["time_s"], entry["status"], entry["failure"]]
     row += cells("translation_m", 3) + cells("quaternion_wxyz", 4)
-    row += [entry.get("reprojection_rms_px"), entry.get("inlier_count"), *cells("box", 4)]
+    row += [entry.get("attitude_belief"), entry.get("reprojection_rms_px"), entry.get("inlier_count"), *cells("box", 4)]
     row += [covariance[i][j] if isinstance(covariance, list) else None for i, j in _COVARIANCE_CELLS]
     for keypoint in cells("keypoints", len(keypoint_names)):
         row += [*keypoint["pixel"], keypoint["score"]] if isinstance(keypoint, dict) else [None] * 3

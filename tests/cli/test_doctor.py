@@ -12,7 +12,7 @@ from gknet.cli import doctor
 from gknet.cli.doctor import Finding, State
 from gknet.cli.main import run
 from gknet.errors import GknetError
-from gknet.locate import Looking
+from gknet.locate import Looking, Seen
 from gknet.spacecraft import Spacecraft
 from tests.cli.toy import toy_spacecraft
 
@@ -26,8 +26,8 @@ class ToyModel:
     looking: Looking = field(default_factory=Looking)
     locator: object = None
 
-    def keypoint_network(self, images: np.ndarray) -> np.ndarray:
-        return np.full((len(images), self.channels, 64, 64), images.mean(), dtype=np.float32)
+    def keypoint_network(self, images: np.ndarray) -> Seen:
+        return Seen(np.full((len(images), self.channels, 64, 64), images.mean(), dtype=np.float32))
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,8 @@ def test_words() -> None:
     assert confidence(estimate) == pytest.approx(estimate.keypoints.score.mean())
     assert describe(frame, Estimate(failure="dark")) == ["toy/1", "no pose: dark"]
     assert confidence(Estimate(failure="dark")) is None
+    for belief, said in ((0.97, "belief in the attitude 0.97"), (0.31, "belief in the attitude 0.31, perhaps a twin")):
+        assert describe(frame, replace(estimate, attitude_belief=belief))[3] == said
 
 
 def test_score_colours_grow_lighter() -> None:

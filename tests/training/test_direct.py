@@ -235,6 +235,7 @@ def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     frame = frames.frame(0)
     estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(POINTS))
     assert (estimate.cam_from_body is None) == (estimate.failure is not None)
+    assert (estimate.attitude_belief is None) == (estimate.cam_from_body is None)
 
 
 def exported(estimator: DirectEstimator) -> torch.nn.Module:

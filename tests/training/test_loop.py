@@ -14,8 +14,12 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
 import gknet.training.export as exporting  # noqa: E402
+from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
+from gknet.estimator import load_estimator  # noqa: E402
+from gknet.network.build import build  # noqa: E402
 from gknet.onnx_network import OnnxNetwork  # noqa: E402
+from gknet.spacecraft import spacecraft_from_toml  # noqa: E402
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
 from gknet.training.export import export_run  # noqa: E402
 from gknet.training.loop import train  # noqa: E402
@@ -134,13 +138,30 @@ def test_exports_agree_with_torch_and_know_what_they_are(
         size = network.metadata.input_size
         assert size == load_run(run).input_size == 64  # the last stage's
         assert network(np.zeros((2, 3, size, size), np.float32)).shape == (2, channels, size // 4, size // 4)
-        places = 864 * channels * 8 * 8 if run == glancing else 0  # where attitudes put keypoints
+        assert network.metadata.bins == (12 if kind == "keypoints" else None)
+        places = 864 * channels * 8 * 8 if kind == "keypoints" else 0  # where attitudes put keypoints
         numbers = places + sum(t.numel() for t in load_weights(run / BEST).values())
         assert result.onnx_path.stat().st_size < 0.65 * 4 * numbers
         assert b"site-packages" not in result.onnx_path.read_bytes()  # no traces of the machine that exported it
         again = load_weights(result.weights_path)
         for name, tensor in load_weights(run / BEST).items():
             torch.testing.assert_close(again[name], tensor, atol=1e-3, rtol=1e-3)
+
+
+def test_an_exported_belief_in_the_attitude_is_that_of_the_trained_weights(glancing: Path, tmp_path: Path) -> None:
+    run = load_run(glancing)
+    spacecraft = spacecraft_from_toml(run.spacecraft_toml, "run.json")
+    trained = build(run.network, spacecraft.adjacency, spacecraft.points_m, run.graph, run.loss).eval()
+    trained.load_state_dict(load_weights(glancing / BEST))
+    images = np.random.default_rng(0).random((2, 3, 64, 64), dtype=np.float32)
+    seen = OnnxNetwork(export_run(glancing, tmp_path).onnx_path, threads=1).seen(images)
+    with torch.no_grad():
+        heatmaps, attitude = trained.seen(torch.from_numpy(images))
+    np.testing.assert_allclose(seen.heatmaps, heatmaps, atol=0.01)
+    np.testing.assert_allclose(seen.attitude, attitude, atol=1e-3)
+    np.testing.assert_allclose(seen.attitude.sum(axis=1), 1, rtol=1e-4)
+    estimator = load_estimator(tmp_path, threads=1)
+    assert estimator.bins == AttitudeBins(12)
 
 
 def test_an_export_that_differs_is_refused(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

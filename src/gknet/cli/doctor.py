@@ -135,7 +135,10 @@ def _try_model(name: str) -> str:
     if isinstance(estimator, DirectEstimator):
         expected = {"direct": (estimator.network, looking.input_size, 3 + estimator.bins.count)}
     else:
-        expected = {"keypoints": (estimator.keypoint_network, looking.input_size, estimator.spacecraft.keypoint_count)}
+        see = estimator.keypoint_network
+        expected = {
+            "keypoints": (lambda images: see(images).heatmaps, looking.input_size, estimator.spacecraft.keypoint_count)
+        }
     if estimator.locator is not None:
         expected["locator"] = (estimator.locator, looking.locator_size, 5)
     words = []

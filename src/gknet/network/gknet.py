@@ -76,6 +76,7 @@ class GKNet(HeatmapNetwork):
         super().__init__(loss, stride=4)
         self.config = config
         self.looks_twice = config.graph != "none"
+        self.attitude_bins = config.bins or None
         keypoints = len(adjacency)
         self.encoder = Encoder(config.width)
         widths = self.encoder.widths

@@ -77,6 +77,8 @@ class HeatmapNetwork(nn.Module, ABC):
     input_size = 256
     looks_twice = False
     """Whether `branches` takes hints, as GKNet's does."""
+    attitude_bins: int | None = None
+    """Cells to a turn of a belief in the attitude; None without one."""
 
     def __init__(self, loss: str, stride: int) -> None:
         super().__init__()
@@ -90,5 +92,10 @@ class HeatmapNetwork(nn.Module, ABC):
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n hs ws"]:
         """RGB in 0 to 1 -> heatmaps."""
-        fused = self.branches(image).fused
-        return expected_heatmaps(fused) if self.loss == "likelihood" else fused
+        return self.seen(image)[0]
+
+    def seen(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        """Heatmaps (b, n, hs, ws) and, of a network that has one, its belief in the attitude's classes (b, k)."""
+        branches = self.branches(image)
+        heatmaps = expected_heatmaps(branches.fused) if self.loss == "likelihood" else branches.fused
+        return (heatmaps,) if branches.attitude is None else (heatmaps, branches.attitude.softmax(dim=1))

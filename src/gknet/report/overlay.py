@@ -25,6 +25,10 @@ _UNSEEN_SCORE = 0.05
 """A keypoint below has no place of its own, and is not drawn."""
 
 
+DOUBTED = 0.5
+"""A belief in the attitude below this is a doubt that is put in words."""
+
+
 def draw_overlay(
     frame: Frame,
     spacecraft: Spacecraft,
@@ -62,7 +66,7 @@ def draw_overlay(
 
 
 def describe(frame: Frame, estimate: Estimate) -> list[str]:
-    """Name, range with its standard deviation, and how sure the keypoints are; or why there is no pose."""
+    """Name, range with its standard deviation, how sure the keypoints and the attitude are; or why there is no pose."""
     if estimate.cam_from_body is None:
         return [frame.name, f"no pose: {estimate.failure}"]
     position = estimate.cam_from_body.translation_m
@@ -76,6 +80,9 @@ def describe(frame: Frame, estimate: Estimate) -> list[str]:
     sure = confidence(estimate)
     if sure is not None and estimate.inliers is not None:
         lines.append(f"confidence {sure:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
+    if estimate.attitude_belief is not None:
+        doubt = ", perhaps a twin" if estimate.attitude_belief < DOUBTED else ""
+        lines.append(f"belief in the attitude {estimate.attitude_belief:.2f}{doubt}")
     if estimate.reprojection_rms_px is not None:
         lines.append(f"reprojection {estimate.reprojection_rms_px:.2f} px rms")
     return lines

@@ -30,6 +30,9 @@ def charts(evaluation: Evaluation) -> list[str]:
     for by, words, label, unit in conditions:
         drawn.append(_by_condition(evaluation, by, f"RMSE by {words}", label, "rmse_px", "mean RMSE in px", unit))
         drawn.append(_by_condition(evaluation, by, f"E_q by {words}", label, "e_q_rad", "mean E_q in rad", unit))
+    if any(b.by == "attitude_belief" for run in evaluation.runs for b in run.summary.bins):
+        by, words, label = "attitude_belief", "E_q by the belief in the attitude", "belief in attitudes like the pose's"
+        drawn.append(_by_condition(evaluation, by, words, label, "e_q_rad", "mean E_q in rad", lambda value: value))
     drawn.append(_by_background(evaluation, "RMSE by background", "rmse_px", "mean RMSE in px"))
     drawn.append(_by_background(evaluation, "E_q by background", "e_q_rad", "mean E_q in rad"))
     return drawn

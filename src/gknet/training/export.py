@@ -28,6 +28,7 @@ from gknet.errors import GknetError
 from gknet.network.backbone import ConvNorm
 from gknet.network.build import Network, build
 from gknet.network.dmanet import DMANet
+from gknet.network.heatmap import HeatmapNetwork
 from gknet.network.locator import Locator
 from gknet.onnx_network import METADATA_KEY
 from gknet.spacecraft import spacecraft_from_toml
@@ -77,19 +78,38 @@ def round_weights(network: nn.Module) -> None:
             tensor.copy_(tensor.half().float())
 
 
+OUTPUTS = ("output", "attitude")
+"""Names in the file; the second one is of a keypoint network with a belief in the attitude."""
+
+
+class Answer(nn.Module):
+    """All that a network has to say of a picture, as a tuple."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Float[Tensor, "b 3 s s"]) -> tuple[Tensor, ...]:
+        network = self.network
+        return network.seen(image) if isinstance(network, HeatmapNetwork) else (network(image),)
+
+
 def onnx_graph(network: Network, example: Float[Tensor, "b 3 s s"]) -> onnx.ModelProto:
-    """The graph image -> output with a free batch axis."""
+    """The graph image -> OUTPUTS, with a free batch axis."""
+    answer = Answer(network)
+    with torch.no_grad():
+        names = OUTPUTS[: len(answer(example))]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            network,
+            answer,
             (example,),
             dynamo=True,
             external_data=False,
             opset_version=OPSET,
             input_names=["image"],
-            output_names=["output"],
+            output_names=list(names),
             dynamic_shapes=({0: torch.export.Dim("batch", min=1, max=1024)},),
             verbose=False,
         )
@@ -134,28 +154,35 @@ def example_images(size: int, folder: Path) -> Float32[ndarray, "b 3 s s"]:
     return np.stack(pictures).transpose(0, 3, 1, 2).astype(np.float32) / 255
 
 
-def run_onnx(model: bytes, images: Float32[ndarray, "b 3 s s"]) -> ndarray:
+def in_rows(outputs: Sequence[ndarray]) -> Float32[ndarray, "b m"]:
+    """All outputs for a picture in one row."""
+    return np.concatenate([output.reshape(len(output), -1) for output in outputs], axis=1)
+
+
+def run_onnx(model: bytes, images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "2 b m"]:
+    """The answers to the pictures one by one, and to all of them together."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    outputs: Sequence[ndarray] = [session.run(None, {"image": image[None]})[0] for image in images]
-    together = session.run(None, {"image": images})[0]
-    alone = np.concatenate(outputs)
+    alone = np.concatenate([in_rows(session.run(None, {"image": image[None]})) for image in images])
+    together = in_rows(session.run(None, {"image": images}))
     if alone.shape != together.shape:
         raise GknetError(f"export: a batch gives {together.shape}, its pictures one by one {alone.shape}")
     return np.stack([alone, together])
 
 
 @torch.inference_mode()
-def run_torch(network: Network, images: Float32[ndarray, "b 3 s s"]) -> ndarray:
-    return network(torch.from_numpy(images)).float().numpy()
+def run_torch(network: Network, images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "b m"]:
+    return in_rows([output.float().numpy() for output in Answer(network)(torch.from_numpy(images))])
 
 
 def shape_of_output(network: Network) -> dict[str, object]:
     """The kind of a network, and what tells its output's shape."""
     if isinstance(network, DMANet):
         return {"kind": "direct", "bins": network.config.bins}
-    return {"kind": "locator" if isinstance(network, Locator) else "keypoints", "stride": network.stride}
+    if isinstance(network, Locator):
+        return {"kind": "locator", "stride": network.stride}
+    return {"kind": "keypoints", "stride": network.stride, "bins": network.attitude_bins}
 
 
 def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:

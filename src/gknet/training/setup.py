@@ -15,7 +15,6 @@ from gknet.direct import has_square_pixels
 from gknet.errors import GknetError
 from gknet.network.build import Network
 from gknet.network.dmanet import DMANet
-from gknet.network.gknet import GKNet
 from gknet.network.locator import Locator
 from gknet.spacecraft import Spacecraft
 from gknet.training.cache import Cache, FrameSource, build_cache
@@ -68,7 +67,7 @@ def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings)
         return LocatorTask(spacecraft, network.stride, settings.input_size)
     if isinstance(network, DMANet):
         return DirectTask(spacecraft, AttitudeBins(network.config.bins), settings.input_size)
-    bins = AttitudeBins(network.config.bins) if isinstance(network, GKNet) and network.config.bins else None
+    bins = None if network.attitude_bins is None else AttitudeBins(network.attitude_bins)
     return KeypointTask(spacecraft, settings.input_size, settings.auxiliary, bins)
 
 
