@@ -87,6 +87,7 @@ def test_an_attitude_puts_keypoints_where_a_camera_far_away_sees_them(chosen: in
     centres = (np.arange(16) + 0.5) / 16
     expected = np.stack([shares.sum(axis=1) @ centres, shares.sum(axis=2) @ centres], axis=1)
     assert np.abs(expected - seen).max() < 0.02
+    assert np.abs(BINS.keypoints(POINTS)[chosen] - seen).max() < 0.01
 
 
 @pytest.mark.parametrize("count", [2, 7])

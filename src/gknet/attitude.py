@@ -93,8 +93,8 @@ class AttitudeBins:
         """How much of a belief lies in cells whose centres are within an angle of an attitude."""
         return float(belief[np.abs(self.centres_wxyz @ attitude_wxyz) >= np.cos(angle_rad / 2)].sum())
 
-    def places(self, points_m: Float[ndarray, "n 3"], cells: int) -> Float[ndarray, "k n cells cells"]:
-        """Where each attitude puts each keypoint in a crop of `cells` x `cells`: shares of 1, row by row.
+    def keypoints(self, points_m: Float[ndarray, "n 3"]) -> Float[ndarray, "k n 2"]:
+        """Where each attitude puts each keypoint, in sides of the crop: x to the right, y down, 0 to 1.
 
         points_m   in the body frame
         Seen from afar (weak perspective), in a crop about the keypoints' box.
@@ -102,8 +102,12 @@ class AttitudeBins:
         seen = np.einsum("kij,nj->kni", rotation_of(self.centres_wxyz).as_matrix()[:, :2], points_m)
         low, high = seen.min(axis=1, keepdims=True), seen.max(axis=1, keepdims=True)
         side = MARGIN * (high - low).max(axis=2, keepdims=True)
-        place = (seen - (low + high) / 2) / side + 0.5
+        return (seen - (low + high) / 2) / side + 0.5
+
+    def places(self, points_m: Float[ndarray, "n 3"], cells: int) -> Float[ndarray, "k n cells cells"]:
+        """Where each attitude puts each keypoint in a crop of `cells` x `cells`, loosely: shares of 1, row by row."""
         centres = (np.arange(cells) + 0.5) / cells
-        along = np.exp(-((place[..., None] - centres) ** 2) / (2 * PLACE_SIGMA**2))  # (k, n, xy, cells)
+        away = self.keypoints(points_m)[..., None] - centres  # (k, n, xy, cells)
+        along = np.exp(-(away**2) / (2 * PLACE_SIGMA**2))
         shares = along[:, :, 1, :, None] * along[:, :, 0, None, :]
         return shares / shares.sum(axis=(2, 3), keepdims=True)

@@ -13,6 +13,7 @@ from tests.network.tiny import points, tiny  # noqa: E402
 
 BINS = AttitudeBins(6)
 PLACES = torch.from_numpy(BINS.places(points(5), 8)).float()
+KEYPOINTS = torch.from_numpy(BINS.keypoints(points(5))).float()
 
 
 def sure_of(*classes: int) -> torch.Tensor:
@@ -23,7 +24,7 @@ def sure_of(*classes: int) -> torch.Tensor:
 
 
 def test_a_prior_says_where_the_attitude_puts_each_keypoint() -> None:
-    prior = AttitudePrior(PLACES)
+    prior = AttitudePrior(PLACES, KEYPOINTS)
     for chosen in (0, 17, 80):
         found = prior(sure_of(chosen), 8, 8)[0]
         torch.testing.assert_close(found, (64 * PLACES[chosen] + OPEN_MIND).log())
@@ -32,19 +33,19 @@ def test_a_prior_says_where_the_attitude_puts_each_keypoint() -> None:
 
 
 def test_a_prior_excludes_nothing_outright_and_has_any_size() -> None:
-    found = AttitudePrior(PLACES)(sure_of(9).expand(2, -1), 16, 24)
+    found = AttitudePrior(PLACES, KEYPOINTS)(sure_of(9).expand(2, -1), 16, 24)
     assert found.shape == (2, 5, 16, 24)
     assert found.min() >= np.log(OPEN_MIND) - 1e-6
     assert found.max() > 1
 
 
 def test_places_belong_to_the_spacecraft_and_not_to_the_weights() -> None:
-    assert set(AttitudePrior(PLACES).state_dict()) == {"gain", "trust"}
+    assert set(AttitudePrior(PLACES, KEYPOINTS).state_dict()) == {"gain", "trust"}
 
 
 def test_keypoints_in_two_minds_agree_on_the_attitude_that_suits_them_all() -> None:
     """Each keypoint alone deems the twin likelier, or knows nothing, but for two that cannot be at the twin's."""
-    prior = AttitudePrior(PLACES)
+    prior = AttitudePrior(PLACES, KEYPOINTS)
     true, twin = 30, 47
     belief = (0.4 * PLACES[true] + 0.6 * PLACES[twin])[None]
     belief[0, 4] = 1 / 64
@@ -57,9 +58,27 @@ def test_keypoints_in_two_minds_agree_on_the_attitude_that_suits_them_all() -> N
 
 
 def test_evidence_is_the_same_at_any_resolution() -> None:
-    prior = AttitudePrior(PLACES)
+    prior = AttitudePrior(PLACES, KEYPOINTS)
     fine = PLACES[:1].repeat_interleave(3, dim=2).repeat_interleave(3, dim=3) / 9
     torch.testing.assert_close(prior.evidence(fine), prior.evidence(PLACES[:1]))
+
+
+def test_votes_put_each_keypoint_where_the_others_say() -> None:
+    """In a crop that is off all votes agree. A wrong keypoint's votes are as wrong; the others put it right."""
+    prior = AttitudePrior(PLACES, KEYPOINTS)
+    for chosen in (5, 66):
+        found = KEYPOINTS[chosen] + torch.tensor([0.08, -0.05])
+        votes = prior.votes(sure_of(chosen), found[None])[0]
+        torch.testing.assert_close(votes, found[:, None].expand(-1, 5, -1))
+        wrong = found.clone()
+        wrong[2] += torch.tensor([0.3, 0.1])
+        votes = prior.votes(sure_of(chosen), wrong[None])[0]
+        torch.testing.assert_close(votes[2, [0, 1, 3, 4]], found[2].expand(4, -1))
+        torch.testing.assert_close(votes[:, 2] - found, torch.tensor([0.3, 0.1]).expand(5, -1))
+    sided = prior.votes(sure_of(5, 66) + torch.eye(BINS.count)[5], KEYPOINTS[None, 5])[0]  # .73 and .27, squared
+    share = 1 / (1 + np.exp(-2))
+    expected = share * KEYPOINTS[5] + (1 - share) * KEYPOINTS[66]
+    torch.testing.assert_close(sided[3, 1], expected[3] + KEYPOINTS[5, 1] - expected[1])
 
 
 @pytest.mark.parametrize("graph", ["skeleton", "none"])

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import position_code  # noqa: E402
+from gknet.network.backbone import POSITION_WIDTH, code_of, position_code  # noqa: E402
 from gknet.network.build import gknet_s, gknet_xs  # noqa: E402
 from gknet.network.gknet import GKNet  # noqa: E402
 from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
@@ -93,6 +93,38 @@ def test_a_message_knows_both_of_its_ends() -> None:
     told_anew = (layer(nodes) - layer(silent))[0]
     assert (told[1] - told_anew[1]).abs().max() > 1e-3
     assert not told[2].any()
+
+
+def test_a_vote_goes_along_its_edge_and_no_other() -> None:
+    torch.manual_seed(5)
+    layer = EdgeConvolution(normalised_adjacency(chain(4)), 8, 8, votes=True)
+    nodes, votes = torch.randn(1, 4, 8), torch.randn(1, 4, 4, POSITION_WIDTH)
+    before = layer(nodes, votes)
+    for to, sender, heard in ((1, 0, True), (2, 3, True), (0, 3, False), (3, 1, False)):
+        other = votes.clone()
+        other[0, to, sender] += 1
+        changed = (layer(nodes, other) - before).abs().amax(dim=(0, 2)) > 1e-6
+        assert changed.tolist() == [heard and k == to for k in range(4)]
+
+
+def test_votes_are_of_what_nodes_are_convinced_of_and_come_before_the_second_look_alone() -> None:
+    """A told keypoint puts its neighbour where the attitude says that it lies from there."""
+    network = tiny(5).eval()
+    assert network.decoder is not None
+    said: list[torch.Tensor | None] = []
+    for layer in network.decoder.layers:
+        layer.graph.register_forward_hook(lambda module, given, out: said.append(given[1]))
+    network.attitude.classes.weight.data.zero_()
+    network.attitude.classes.bias.data = torch.full_like(network.attitude.classes.bias, -400)
+    network.attitude.classes.bias.data[7] = 0
+    truth = torch.zeros(1, 5, 16, 16)
+    truth[0, 1, 3, 9] = 1
+    network.branches(torch.rand(1, 3, 64, 64), Hints(truth, torch.tensor([[False, True, False, False, False]])))
+    assert said[:2] == [None, None]
+    assert said[2] is said[3]
+    place = torch.tensor([9.5, 3.5]) / 16 + network.prior.keypoints[7, 2] - network.prior.keypoints[7, 1]
+    assert said[2] is not None
+    torch.testing.assert_close(said[2][0, 2, 1], code_of(place), atol=1e-4, rtol=1e-4)
 
 
 def glances_at(pixels: torch.Tensor, hints: Hints | None = None) -> list[torch.Tensor]:

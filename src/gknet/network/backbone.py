@@ -33,19 +33,25 @@ def normalised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
     return (image - MEAN) / SPREAD
 
 
-def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
-    """Sines and cosines of the cell centres, in fractions of the map.
+def cell_centres(height: int, width: int, like: Tensor) -> Float[Tensor, "height width 2"]:
+    """x and y of the cells of a map, in fractions of it."""
+    y = (torch.arange(height, device=like.device, dtype=torch.float32) + 0.5) / height
+    x = (torch.arange(width, device=like.device, dtype=torch.float32) + 0.5) / width
+    return torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], dim=2)
+
+
+def code_of(places: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
+    """Sines and cosines of x and y, in fractions of the picture.
 
     The same place of the picture has the same code at every resolution, so one network serves several input sizes.
     """
-    y = (torch.arange(height, device=like.device, dtype=torch.float32) + 0.5) / height
-    x = (torch.arange(width, device=like.device, dtype=torch.float32) + 0.5) / width
-    frequency = torch.tensor(FREQUENCIES, device=like.device)[:, None] * (2 * math.pi)
-    along_x = torch.cat([torch.sin(frequency * x), torch.cos(frequency * x)])  # (c/2, width)
-    along_y = torch.cat([torch.sin(frequency * y), torch.cos(frequency * y)])  # (c/2, height)
-    wide = along_x[:, None, :].expand(-1, height, -1)
-    tall = along_y[:, :, None].expand(-1, -1, width)
-    return torch.cat([wide, tall])
+    phase = places[..., None] * (2 * math.pi * torch.tensor(FREQUENCIES, device=places.device))  # (..., xy, frequency)
+    return torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(-2)
+
+
+def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
+    """The codes of the cells of a map."""
+    return code_of(cell_centres(height, width, like)).permute(2, 0, 1)
 
 
 class ConvNorm(nn.Module):

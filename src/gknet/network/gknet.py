@@ -19,7 +19,9 @@ from gknet.network.backbone import (
     ConvNorm,
     Encoder,
     Pyramid,
+    cell_centres,
     check_input,
+    code_of,
     position_code,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
@@ -90,7 +92,8 @@ class GKNet(HeatmapNetwork):
         if config.bins:
             bins = AttitudeBins(config.bins)
             self.attitude = AttitudeHead(widths[3] + config.node_width, ATTITUDE_WIDTH, bins.count)
-            self.prior = AttitudePrior(torch.from_numpy(bins.places(points_m, PRIOR_CELLS)).float())
+            places, middles = bins.places(points_m, PRIOR_CELLS), bins.keypoints(points_m)
+            self.prior = AttitudePrior(torch.from_numpy(places).float(), torch.from_numpy(middles).float())
         self.decoder: GraphDecoder | None = None
         if config.graph != "none":
             self._build_graph_branch(adjacency)
@@ -100,7 +103,9 @@ class GKNet(HeatmapNetwork):
         edges = normalised_adjacency(adjacency, checked_graph(config.graph))
         self.fine_cells = nn.Conv2d(self.encoder.widths[2], config.node_width, 1)
         seen = config.pyramid_width + POSITION_WIDTH
-        self.decoder = GraphDecoder(edges, config.node_width, config.node_width, config.heads, config.node_layers, seen)
+        self.decoder = GraphDecoder(
+            edges, config.node_width, config.node_width, config.heads, config.node_layers, seen, votes=config.bins > 0
+        )
         self.pixel_position = nn.Linear(POSITION_WIDTH, config.pyramid_width)
         self.pixel_features = ConvNorm(config.pyramid_width, config.pyramid_width, 1, relu=False)
         self.node_filter = nn.Linear(config.node_width, config.pyramid_width + 1)
@@ -135,8 +140,9 @@ class GKNet(HeatmapNetwork):
         first = pixels + nodes
         attitude = self._agreed(attitude, first)
         settled = self._expected(alone, attitude)
-        found = self._convinced(settled + nodes, hints) @ seen
-        nodes = self._node_maps(self.decoder(memory, lambda nodes: found), places)
+        convinced = self._convinced(settled + nodes, hints)
+        found, votes = convinced @ seen, self._votes(attitude, convinced, *alone.shape[2:])
+        nodes = self._node_maps(self.decoder(memory, lambda nodes: found, votes), places)
         return Branches(self.fusion(settled, nodes), settled, nodes, first, attitude)
 
     def _expected(self, maps: Float[Tensor, "b n h w"], attitude: Float[Tensor, "b k"] | None) -> Tensor:
@@ -148,6 +154,15 @@ class GKNet(HeatmapNetwork):
         if attitude is None:
             return None
         return attitude + self.prior.evidence(log_belief(maps.detach()).exp().reshape(maps.shape))
+
+    def _votes(
+        self, attitude: Float[Tensor, "b k"] | None, convinced: Float[Tensor, "b n hw"], height: int, width: int
+    ) -> Float[Tensor, "b to from p"] | None:
+        """The codes of where each keypoint must be by what the others are convinced of (decision 0017)."""
+        if attitude is None:
+            return None
+        found = convinced.float() @ cell_centres(height, width, convinced).flatten(0, 1)
+        return code_of(self.prior.votes(attitude, found))
 
     def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
         """A map as a list of cells that know where they are."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.errors import GknetError
-from gknet.network.backbone import Attention
+from gknet.network.backbone import POSITION_WIDTH, Attention
 
 Graph = Literal["skeleton", "identity", "random", "none"]
 
@@ -72,20 +72,27 @@ class GraphConvolution(nn.Module):
 class EdgeConvolution(nn.Module):
     """Messages along the edges that know both of their ends (EdgeConv, Wang et al. 2019), summed as A~ weighs them.
 
-    Under eq. 2 a node tells all its neighbours the same; here it can tell each where that one must be.
+    Under eq. 2 a node tells all its neighbours the same; here it can tell each where that one must be. `votes` are the
+    codes of such places (decision 0017), of POSITION_WIDTH; a decoder without them says nothing of places.
     """
 
     adjacency: Tensor
 
-    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int) -> None:
+    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, votes: bool = False) -> None:
         super().__init__()
         self.receive = nn.Linear(width, hidden)
         self.send = nn.Linear(width, hidden)
+        self.place = nn.Linear(POSITION_WIDTH, hidden, bias=False) if votes else None
         self.linear = nn.Linear(hidden, width)
         self.register_buffer("adjacency", adjacency, persistent=False)
 
-    def forward(self, nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
-        messages = functional.relu(self.receive(nodes)[:, :, None] + self.send(nodes)[:, None])  # (b, to, from, c)
+    def forward(
+        self, nodes: Float[Tensor, "b n c"], votes: Float[Tensor, "b to from p"] | None = None
+    ) -> Float[Tensor, "b n c"]:
+        said = self.receive(nodes)[:, :, None] + self.send(nodes)[:, None]  # (b, to, from, c)
+        if votes is not None and self.place is not None:
+            said = said + self.place(votes)
+        messages = functional.relu(said)
         return self.linear((self.adjacency.to(messages.dtype)[:, :, None] * messages).sum(dim=2))
 
 
@@ -101,42 +108,66 @@ class GraphLayer(nn.Module):
     messages know both ends; without one (0) the layer is the paper's.
     """
 
-    def __init__(self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, glance: int) -> None:
+    def __init__(
+        self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, glance: int, votes: bool
+    ) -> None:
         super().__init__()
         self.look = Attention(width, heads)
         self.after_look = nn.LayerNorm(width)
         if glance:
             self.seen = nn.Linear(glance, width)
             self.after_seen = nn.LayerNorm(width)
-        self.graph = (EdgeConvolution if glance else GraphConvolution)(adjacency, width, hidden)
+        self.graph: EdgeConvolution | GraphConvolution
+        if glance:
+            self.graph = EdgeConvolution(adjacency, width, hidden, votes)
+        else:
+            self.graph = GraphConvolution(adjacency, width, hidden)
         self.after_graph = nn.LayerNorm(width)
 
     def forward(
-        self, nodes: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"], glance: Glance | None
+        self,
+        nodes: Float[Tensor, "b n c"],
+        memory: Float[Tensor, "b m c"],
+        glance: Glance | None,
+        votes: Float[Tensor, "b to from p"] | None,
     ) -> Float[Tensor, "b n c"]:
         nodes = self.after_look(nodes + self.look(nodes, memory))
         if glance is not None:
             nodes = self.after_seen(nodes + self.seen(glance(nodes)))
-        return self.after_graph(nodes + self.graph(nodes))
+        told = self.graph(nodes, votes) if isinstance(self.graph, EdgeConvolution) else self.graph(nodes)
+        return self.after_graph(nodes + told)
 
 
 class GraphDecoder(nn.Module):
     """One learned query per keypoint becomes that keypoint's node; any number of keypoints.
 
     glance  channels of what a node sees at a glance; 0 where it is given none
+    votes   whether nodes that glance tell each other places as well
     """
 
     def __init__(
-        self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, layers: int, glance: int = 0
+        self,
+        adjacency: Float[Tensor, "n n"],
+        width: int,
+        hidden: int,
+        heads: int,
+        layers: int,
+        glance: int = 0,
+        votes: bool = False,
     ) -> None:
         super().__init__()
         self.queries = nn.Parameter(torch.randn(len(adjacency), width) * 0.5)
-        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads, glance) for _ in range(layers)])
+        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads, glance, votes) for _ in range(layers)])
 
-    def forward(self, memory: Float[Tensor, "b m c"], glance: Glance | None = None) -> Float[Tensor, "b n c"]:
+    def forward(
+        self,
+        memory: Float[Tensor, "b m c"],
+        glance: Glance | None = None,
+        votes: Float[Tensor, "b to from p"] | None = None,
+    ) -> Float[Tensor, "b n c"]:
         nodes = self.queries.expand(memory.shape[0], -1, -1)
         for layer in self.layers:
-            nodes = layer(nodes, memory, glance)
+            nodes = layer(nodes, memory, glance, votes)
         return nodes
 
 
