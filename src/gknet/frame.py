@@ -122,6 +122,10 @@ class Keypoints:
     covariance_px2: Float[ndarray, "n 2 2"]
 
 
+DOUBTED_BELIEF = 0.5
+"""A belief in the attitude below this is a doubt that is put in words."""
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The answer for one image. `failure` says why there is no pose, and is None exactly when there is one.
@@ -148,3 +152,8 @@ class Estimate:
     def __post_init__(self) -> None:
         if (self.cam_from_body is None) != (self.failure is not None):
             raise GknetError("estimate: expected either a pose or the reason why there is none")
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the network that saw the keypoints believes more in other attitudes than in the pose's."""
+        return self.attitude_belief is not None and self.attitude_belief < DOUBTED_BELIEF

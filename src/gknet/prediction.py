@@ -38,7 +38,7 @@ class PredictionFiles:
         self.poses_path = self.folder / f"poses.{layout}"
         self.overlay_folder = self.folder / "overlays" if overlays else None
         self.video_path = self.folder / "overlay.mp4" if fps is not None else None
-        self.pose_count = 0
+        self.pose_count = self.doubted_count = 0
         self.failures: list[Unreadable] = []
         self._spacecraft, self._layout, self._fps = spacecraft, layout, fps
         self._stack = ExitStack()
@@ -66,6 +66,7 @@ class PredictionFiles:
             self._poses.add(frame.name, frame.time_s, estimate)
         if estimate.failure is None:
             self.pose_count += 1
+            self.doubted_count += estimate.is_doubted
         else:
             self.failures.append(Unreadable(frame.name, estimate.failure))
         if self.overlay_folder is None and self._video is None:

@@ -81,7 +81,7 @@ def test_page_holds_everything_and_agrees(
             assert page.values[f"{protocol}.{name}.median"] == statistic["median"]
             assert statistic["low"] <= statistic["mean"] <= statistic["high"]
     assert page.tags.count("img") == 10
-    assert page.tags.count("svg") == 12
+    assert page.tags.count("svg") == 13
     assert all(link.startswith("data:image/jpeg;base64,") for link in page.links)
     printed = capsys.readouterr().out
     mean = metrics["runs"]["detected"]["metrics"]["e_t"]["mean"]

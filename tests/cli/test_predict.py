@@ -76,7 +76,7 @@ def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
 def test_folder_goes_on_past_bad_pictures(
     use: Use, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    use(ToyEstimator(blind=frozenset({1})))
+    use(ToyEstimator(blind=frozenset({1}), doubted=frozenset({2})))
     data = (pictures / "a.jpg").read_bytes()
     (pictures / "half.jpg").write_bytes(data[: len(data) // 2])
     (pictures / "text.png").write_text("no picture")
@@ -93,6 +93,8 @@ def test_folder_goes_on_past_bad_pictures(
     words = capsys.readouterr().out
     assert "2 of 5 pictures have a pose, 3 failed" in words
     assert "truncated" in words
+    assert "1 of the poses may be a twin's" in words
+    assert [record.get("attitude_belief") for record in records(out)] == [0.9, None, 0.2, None, None]
     assert (out / "overlays" / "deep_c.jpg").exists()
 
 

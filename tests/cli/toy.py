@@ -92,10 +92,12 @@ def _annotation(index: int, number: int) -> Annotation:
 
 @dataclass(frozen=True, eq=False)
 class ToyEstimator:
-    """Knows the truth of a toy picture by its number; `error` shifts it, and numbers in `blind` have no pose."""
+    """Knows the truth of a toy picture by its number; `error` shifts it, numbers in `blind` have no pose, and those in
+    `doubted` one that its belief is against."""
 
     error: float = 0.0
     blind: frozenset[int] = frozenset()
+    doubted: frozenset[int] = frozenset()
     spacecraft: Spacecraft = field(default_factory=toy_spacecraft)
     locator: object = "the toy finds itself"
 
@@ -115,7 +117,8 @@ class ToyEstimator:
             np.tile(np.eye(2), (count, 1, 1)),
         )
         covariance = np.diag([4e-4, 4e-4, 4e-4, 2.5e-3, 2.5e-3, 2.5e-3])
-        return Estimate(keypoints, moved, covariance, np.ones(count, dtype=bool), self.error, box or found)
+        inliers, belief = np.ones(count, dtype=bool), 0.2 if number in self.doubted else 0.9
+        return Estimate(keypoints, moved, covariance, inliers, self.error, box or found, attitude_belief=belief)
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,11 +122,15 @@ def predict_all(
 
 def tell(files: PredictionFiles) -> None:
     """The summary on standard output; GknetError when no picture gave a pose."""
+    from gknet.frame import DOUBTED_BELIEF
+
     failures = files.failures
     if files.pose_count == 0:
         first = f"; the first, {failures[0].name}: {failures[0].reason}" if failures else ""
         raise GknetError(f"no pose in any of {files.count} pictures{first}")
     typer.echo(f"{files.pose_count} of {files.count} pictures have a pose, {len(failures)} failed")
+    if files.doubted_count:
+        typer.echo(f"  {files.doubted_count} of the poses may be a twin's: attitude_belief is below {DOUBTED_BELIEF}")
     for failure in failures[:_SHOWN_FAILURES]:
         typer.echo(f"  {failure.name}: {failure.reason}")
     if len(failures) > _SHOWN_FAILURES:

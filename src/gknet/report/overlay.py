@@ -25,10 +25,6 @@ _UNSEEN_SCORE = 0.05
 """A keypoint below has no place of its own, and is not drawn."""
 
 
-DOUBTED = 0.5
-"""A belief in the attitude below this is a doubt that is put in words."""
-
-
 def draw_overlay(
     frame: Frame,
     spacecraft: Spacecraft,
@@ -81,7 +77,7 @@ def describe(frame: Frame, estimate: Estimate) -> list[str]:
     if sure is not None and estimate.inliers is not None:
         lines.append(f"confidence {sure:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
     if estimate.attitude_belief is not None:
-        doubt = ", perhaps a twin" if estimate.attitude_belief < DOUBTED else ""
+        doubt = ", perhaps a twin" if estimate.is_doubted else ""
         lines.append(f"belief in the attitude {estimate.attitude_belief:.2f}{doubt}")
     if estimate.reprojection_rms_px is not None:
         lines.append(f"reprojection {estimate.reprojection_rms_px:.2f} px rms")
