@@ -76,20 +76,30 @@ def table(results: Path, recipe: str) -> str:
     return "\n".join(lines)
 
 
-def background_table(results: Path, recipe: str) -> str:
-    """Markdown: mean, median RMSE of the oracle crop, by what is behind the spacecraft."""
-    lines = [
-        "| spacecraft, oracle crop | black sky, frames: RMSE px | Earth in view, frames: RMSE px |",
-        "|---" * 3 + "|",
-    ]
+def binned_table(results: Path, recipe: str, words: str, by: str, metric: str, columns: dict[float, str]) -> str:
+    """Markdown: mean, median of a metric in the bins by a condition; `columns` are their lower ends and names."""
+    header = [f"spacecraft, {words}", *[f"{column}, frames: {COLUMNS[metric]}" for column in columns.values()]]
+    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
     for name in NAMES:
-        bins = {b["low"] > 0: b for b in figures(results, name, recipe)["bins"] if b["by"] == "earth_in_view"}
+        bins = {b["low"]: b for b in figures(results, name, recipe, words)["bins"] if b["by"] == by}
         cells = [name]
-        for earth in (False, True):
-            rmse = bins[earth]["metrics"]["rmse_px"] if earth in bins else None
-            cells.append("none" if rmse is None else f"{rmse['frames']}: {rmse['mean']:.3g}, {rmse['median']:.3g}")
+        for low in columns:
+            found = bins[low]["metrics"][metric] if low in bins else None
+            cells.append("none" if found is None else f"{found['frames']}: {found['mean']:.3g}, {found['median']:.3g}")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def background_table(results: Path, recipe: str) -> str:
+    """RMSE of the oracle crop, by what is behind the spacecraft."""
+    columns = {0.0: "black sky", 0.5: "Earth in view"}
+    return binned_table(results, recipe, "oracle crop", "earth_in_view", "rmse_px", columns)
+
+
+def belief_table(results: Path, recipe: str) -> str:
+    """E_q of the detected crop, by the belief in the attitude."""
+    columns = {0.0: "belief below .5", 0.5: ".5 to .8", 0.8: ".8 to .95", 0.95: "above"}
+    return binned_table(results, recipe, "detected crop", "attitude_belief", "e_q_rad", columns)
 
 
 def validated(path: Path) -> dict[str, Any]:
@@ -148,6 +158,7 @@ def main() -> None:
     for recipe in ("skd", "skd-hard"):
         print(f"\n{recipe}: mean, median\n\n{table(arguments.results, recipe)}")
         print(f"\n{recipe}, by background\n\n{background_table(arguments.results, recipe)}")
+        print(f"\n{recipe}, by the belief in the attitude\n\n{belief_table(arguments.results, recipe)}")
 
 
 if __name__ == "__main__":
