@@ -321,6 +321,9 @@ def test_bad_use_is_refused() -> None:
         estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
     with pytest.raises(GknetError, match="give a box"):
         Estimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
+    few = replace(estimator, keypoint_network=lambda images: Seen(np.zeros((1, 14, 64, 64)), np.zeros((1, 4))))
+    with pytest.raises(GknetError, match="864 classes of attitude, got 4"):
+        replace(few, bins=AttitudeBins(12)).estimate(frame.image, CAMERA, frame.true_box(POINTS))
     wrong = Estimator(lambda images: Seen(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
     with pytest.raises(GknetError, match="14 heatmaps"):
         wrong.estimate(frame.image, CAMERA, frame.true_box(POINTS))

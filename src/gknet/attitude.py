@@ -91,7 +91,8 @@ class AttitudeBins:
 
     def share_near(self, belief: Float[ndarray, "k"], attitude_wxyz: Float[ndarray, "4"], angle_rad: float) -> float:
         """How much of a belief lies in cells whose centres are within an angle of an attitude."""
-        return float(belief[np.abs(self.centres_wxyz @ attitude_wxyz) >= np.cos(angle_rad / 2)].sum())
+        near = np.abs(self.centres_wxyz @ attitude_wxyz) >= np.cos(angle_rad / 2)
+        return min(1.0, float(belief[near].sum()))  # shares may sum to a little more
 
     def keypoints(self, points_m: Float[ndarray, "n 3"]) -> Float[ndarray, "k n 2"]:
         """Where each attitude puts each keypoint, in sides of the crop: x to the right, y down, 0 to 1.

@@ -61,6 +61,8 @@ class Estimator(CropEstimator):
                 f"keypoint network: expected {self.spacecraft.keypoint_count} heatmaps for {self.spacecraft.name}, "
                 f"got {len(heatmaps)}"
             )
+        if attitude is not None and self.bins is not None and len(attitude) != self.bins.count:
+            raise GknetError(f"keypoint network: expected {self.bins.count} classes of attitude, got {len(attitude)}")
         keypoints = decode_heatmaps(heatmaps, crop.size / heatmaps.shape[2], self.decoding)
         return keypoints_to_image(keypoints, crop), attitude
 

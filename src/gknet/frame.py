@@ -130,14 +130,14 @@ DOUBTED_BELIEF = 0.5
 class Estimate:
     """The answer for one image. `failure` says why there is no pose, and is None exactly when there is one.
 
-    keypoints    as detected; of a direct estimator, which detects none, where its pose puts them
-    covariance   (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
-                 R_true = exp([dw]x) R, t_true = t + dt
-    inliers      (n,) bool: keypoints that the pose agrees with
-    box          where the spacecraft was looked for, in pixels of the image
+    keypoints         as detected; of a direct estimator, which detects none, where its pose puts them
+    covariance        (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
+                      R_true = exp([dw]x) R, t_true = t + dt
+    inliers           (n,) bool: keypoints that the pose agrees with
+    box               where the spacecraft was looked for, in pixels of the image
     attitude_belief   0 to 1: the network's belief in attitudes within 60 degrees of the pose's. The rest of it is in
-                 others: below a half the pose may well be that of a twin, whatever the covariance says. None of a
-                 network that has no such belief
+                      others: below a half the pose may well be that of a twin, whatever the covariance says. None of a
+                      network that has no such belief
     """
 
     keypoints: Keypoints | None = None
