@@ -321,7 +321,8 @@ def test_bad_use_is_refused() -> None:
         estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
     with pytest.raises(GknetError, match="give a box"):
         Estimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
-    few = replace(estimator, keypoint_network=lambda images: Seen(np.zeros((1, 14, 64, 64)), np.zeros((1, 4))))
+    see = estimator.keypoint_network
+    few = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=np.ones((1, 4), np.float32)))
     with pytest.raises(GknetError, match="864 classes of attitude, got 4"):
         replace(few, bins=AttitudeBins(12)).estimate(frame.image, CAMERA, frame.true_box(POINTS))
     wrong = Estimator(lambda images: Seen(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
