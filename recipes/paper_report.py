@@ -247,7 +247,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
         + rmse_table(trials, GRAPHS, "oracle", "rmse_low_px")
     )
     parts.append("## The skeleton less the other graphs, paired by frame\n")
-    metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped")
+    metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
     parts.append("## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + swap_table(trials))
     return "\n\n".join(parts) + "\n"
