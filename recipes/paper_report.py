@@ -17,7 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from gknet.atomic import write_text
-from gknet.comparison import LOW_VISIBILITY, Interval, Trial, difference, mean_of
+from gknet.comparison import (
+    ATTITUDE_HOLDS_RAD,
+    LOW_VISIBILITY,
+    Interval,
+    Trial,
+    difference,
+    mean_of,
+    where_attitudes_hold,
+)
 from gknet.errors import GknetError, ends_in_one_line
 from gknet.fleet import NAMES
 from gknet.report.chart import Axis, Series, bar_chart, standalone
@@ -116,7 +124,9 @@ def pose_table(trials: Trials, protocol: str) -> str:
     return markdown(["method", *[f"{name}: E_t; E_q rad" for name in NAMES], "the paper's, its own spacecraft"], rows)
 
 
-def difference_row(trials: Trials, first: str, second: str, metric: str, protocol: str) -> list[str]:
+def difference_row(
+    trials: Trials, first: str, second: str, metric: str, protocol: str, attitudes_hold: bool = False
+) -> list[str]:
     """The first method less the second on each spacecraft, paired by frame; bold where the interval excludes zero."""
     row = []
     for spacecraft in NAMES:
@@ -126,6 +136,8 @@ def difference_row(trials: Trials, first: str, second: str, metric: str, protoco
             continue
         seeds = {trial.seed for trial in pair[0]} & {trial.seed for trial in pair[1]}
         ours, theirs = ([trial for trial in side if trial.seed in seeds] for side in pair)
+        if attitudes_hold:
+            ours, theirs = where_attitudes_hold(ours, theirs)
         try:
             gap = difference(ours, theirs, metric)
             part = 100 * gap.mean / mean_of(theirs, metric).mean
@@ -138,11 +150,16 @@ def difference_row(trials: Trials, first: str, second: str, metric: str, protoco
 
 
 def difference_table(
-    trials: Trials, firsts: tuple[str, ...], seconds: tuple[str, ...], metrics: tuple[str, ...], protocol: str
+    trials: Trials,
+    firsts: tuple[str, ...],
+    seconds: tuple[str, ...],
+    metrics: tuple[str, ...],
+    protocol: str,
+    attitudes_hold: bool = False,
 ) -> str:
-    """Each first method less each second one."""
+    """Each first method less each second one; on all frames, or on those in which the attitudes of both hold."""
     rows = [
-        [f"{first} less {second}", metric, *difference_row(trials, first, second, metric, protocol)]
+        [f"{first} less {second}", metric, *difference_row(trials, first, second, metric, protocol, attitudes_hold)]
         for first in firsts
         for second in seconds
         for metric in metrics
@@ -202,6 +219,24 @@ def swap_table(trials: Trials, protocol: str = "oracle") -> str:
     return markdown(["graph", *NAMES], rows)
 
 
+def wrong_attitude_table(trials: Trials, protocol: str = "oracle") -> str:
+    """Of the frames, and of the sum of the RMSE of hidden keypoints, what belongs to wrong attitudes."""
+    rows = []
+    for name in GRAPHS:
+        row = []
+        for spacecraft in NAMES:
+            found = trials.get((name, spacecraft, protocol))
+            if not found:
+                row.append("not run")
+                continue
+            wrong = np.concatenate([trial.values["e_q_rad"] for trial in found]) > ATTITUDE_HOLDS_RAD
+            hidden = np.concatenate([trial.values["rmse_hidden_px"] for trial in found])
+            part = np.nansum(hidden[wrong]) / max(np.nansum(hidden), 1e-9)
+            row.append(f"{wrong.sum()} of {len(wrong)}, {100 * part:.0f} % of the RMSE")
+        rows.append([name, *row])
+    return markdown(["graph", *NAMES], rows)
+
+
 def bars(trials: Trials, spacecraft: str) -> str:
     """RMSE of every method that detects keypoints, of all and of the hidden ones, as an SVG file."""
     names = [name for name in (*ORDER, *GRAPHS[1:]) if name != DIRECT and trials.get((name, spacecraft, "oracle"))]
@@ -249,6 +284,10 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
     parts.append("## The skeleton less the other graphs, paired by frame\n")
     metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
+    parts.append(f"## Frames with a wrong attitude (E_q above {ATTITUDE_HOLDS_RAD} rad), ours, oracle crop\n")
+    parts[-1] += wrong_attitude_table(trials)
+    parts.append("## The skeleton less the other graphs, where the attitudes of both hold\n")
+    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle", attitudes_hold=True)
     parts.append("## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + swap_table(trials))
     return "\n\n".join(parts) + "\n"
 

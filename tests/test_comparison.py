@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gknet.comparison import LOW_VISIBILITY, Trial, difference, mean_of
+from gknet.comparison import LOW_VISIBILITY, Trial, difference, mean_of, where_attitudes_hold
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.evaluation import evaluate
@@ -49,6 +49,22 @@ def test_a_difference_is_paired() -> None:
     alone = mean_of([trial("a", base)], "rmse_px")
     assert gap.high - gap.low < (alone.high - alone.low) / 3
     assert not difference([trial("a", base)], [trial("b", rng.permutation(base))], "rmse_px").excludes_zero
+
+
+def test_where_attitudes_hold_both_are_judged_on_the_frames_that_both_know() -> None:
+    def known(method: str, rmse: np.ndarray, e_q: np.ndarray) -> Trial:
+        return replace(trial(method, rmse), values={"rmse_px": rmse, "e_q_rad": e_q})
+
+    rmse, right = np.arange(30.0), np.full(30, 0.1)
+    twin, other = right.copy(), right.copy()
+    twin[:10], other[5:12] = 3.1, 0.36
+    pair = [known("a", rmse, twin)], [known("b", 2 * rmse, other)]
+    ours, theirs = where_attitudes_hold(*pair)
+    for (masked,), factor in ((ours, 1), (theirs, 2)):
+        assert np.isnan(masked.values["rmse_px"][:12]).all()
+        np.testing.assert_array_equal(masked.values["rmse_px"][12:], factor * rmse[12:])
+    assert difference(ours, theirs, "rmse_px").mean == pytest.approx(-rmse[12:].mean())
+    assert np.isfinite(pair[0][0].values["rmse_px"]).all()
 
 
 def test_seeds_that_disagree_widen_the_interval() -> None:

@@ -7,10 +7,10 @@ which are alike, and over seeds, which are few: both are drawn with replacement,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from gknet.errors import GknetError
@@ -18,6 +18,9 @@ from gknet.evaluation import Case, Run, confusion
 
 LOW_VISIBILITY = 0.6
 """Share of the keypoints that are seen, below which a frame counts as one of low visibility."""
+
+ATTITUDE_HOLDS_RAD = 0.35
+"""E_q (20 degrees) beyond which an attitude is wrong as a whole, a twin's or a guess, and not just inexact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +143,19 @@ def difference(
     gap = _resampled(*tables[0], *draws) - _resampled(*tables[1], draws[0], seeds)
     means = [table.sum() / counts.sum() for table, counts in tables]
     return Interval(float(means[0] - means[1]), *_ends(gap))
+
+
+def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
+    """Both methods, seed by seed, on the frames in which the attitudes of both hold; the other values are NaN."""
+
+    def masked(trial: Trial, known: Bool[ndarray, "m"]) -> Trial:
+        return replace(trial, values={name: np.where(known, column, np.nan) for name, column in trial.values.items()})
+
+    pairs = []
+    for one, other in zip(first, second, strict=True):
+        known = np.maximum(one.values["e_q_rad"], other.values["e_q_rad"]) <= ATTITUDE_HOLDS_RAD
+        pairs.append((masked(one, known), masked(other, known)))
+    return [one for one, _ in pairs], [other for _, other in pairs]
 
 
 def _by_sequence(
