@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -202,39 +203,28 @@ def curve_table(costs: dict[str, list[dict]]) -> str:
     return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "pictures seen there", "seeds"], rows)
 
 
-def swap_table(trials: Trials, protocol: str = "oracle") -> str:
-    """Of the detections in view: at their own keypoint, at another one (a swap), at none."""
+def graph_table(trials: Trials, words: Callable[[list[Trial]], str], protocol: str = "oracle") -> str:
+    """What `words` says of the trials of each graph on each spacecraft."""
     rows = []
     for name in GRAPHS:
-        row = []
-        for spacecraft in NAMES:
-            found = trials.get((name, spacecraft, protocol))
-            if not found:
-                row.append("not run")
-                continue
-            matrix = sum(trial.confusion for trial in found)
-            right, all_near = np.trace(matrix), matrix.sum()
-            row.append(f"{right} right, {all_near - right} swapped ({100 * (1 - right / max(all_near, 1)):.1f} %)")
-        rows.append([name, *row])
+        found = [trials.get((name, spacecraft, protocol)) for spacecraft in NAMES]
+        rows.append([name, *[words(each) if each else "not run" for each in found]])
     return markdown(["graph", *NAMES], rows)
 
 
-def wrong_attitude_table(trials: Trials, protocol: str = "oracle") -> str:
+def swaps(found: list[Trial]) -> str:
+    """Of the detections that lie at a keypoint: at their own, at another one (a swap)."""
+    matrix = sum(trial.confusion for trial in found)
+    right, all_near = np.trace(matrix), matrix.sum()
+    return f"{right} right, {all_near - right} swapped ({100 * (1 - right / max(all_near, 1)):.1f} %)"
+
+
+def wrong_attitudes(found: list[Trial]) -> str:
     """Of the frames, and of the sum of the RMSE of hidden keypoints, what belongs to wrong attitudes."""
-    rows = []
-    for name in GRAPHS:
-        row = []
-        for spacecraft in NAMES:
-            found = trials.get((name, spacecraft, protocol))
-            if not found:
-                row.append("not run")
-                continue
-            wrong = np.concatenate([trial.values["e_q_rad"] for trial in found]) > ATTITUDE_HOLDS_RAD
-            hidden = np.concatenate([trial.values["rmse_hidden_px"] for trial in found])
-            part = np.nansum(hidden[wrong]) / max(np.nansum(hidden), 1e-9)
-            row.append(f"{wrong.sum()} of {len(wrong)}, {100 * part:.0f} % of the RMSE")
-        rows.append([name, *row])
-    return markdown(["graph", *NAMES], rows)
+    wrong = np.concatenate([trial.values["e_q_rad"] for trial in found]) > ATTITUDE_HOLDS_RAD
+    hidden = np.concatenate([trial.values["rmse_hidden_px"] for trial in found])
+    part = np.nansum(hidden[wrong]) / max(np.nansum(hidden), 1e-9)
+    return f"{wrong.sum()} of {len(wrong)}, {100 * part:.0f} % of the RMSE"
 
 
 def bars(trials: Trials, spacecraft: str) -> str:
@@ -285,10 +275,12 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
     metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
     parts.append(f"## Frames with a wrong attitude (E_q above {ATTITUDE_HOLDS_RAD} rad), ours, oracle crop\n")
-    parts[-1] += wrong_attitude_table(trials)
+    parts[-1] += graph_table(trials, wrong_attitudes)
     parts.append("## The skeleton less the other graphs, where the attitudes of both hold\n")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle", attitudes_hold=True)
-    parts.append("## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + swap_table(trials))
+    parts.append(
+        "## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + graph_table(trials, swaps)
+    )
     return "\n\n".join(parts) + "\n"
 
 

@@ -43,7 +43,6 @@ class Sight:
     crop: Crop
     keypoints: Keypoints
     cells_per_px: float
-    attitude: Float[ndarray, "k"] | None = None
 
     def decoded(self, decoding: Decoding) -> Keypoints:
         """The keypoints as `decoding` would have it."""
@@ -52,8 +51,7 @@ class Sight:
 
     def estimate(self, estimator: Estimator) -> Estimate:
         """The pose, without running the network again."""
-        keypoints = self.decoded(estimator.decoding)
-        return estimator.pose_of(keypoints, self.attitude, self.frame.camera, self.box, self.crop)
+        return estimator.pose_of(self.decoded(estimator.decoding), self.frame.camera, self.box, self.crop)
 
 
 def sight(frame: Frame, bare: Estimator, stride: float) -> Sight:
@@ -62,8 +60,8 @@ def sight(frame: Frame, bare: Estimator, stride: float) -> Sight:
     if box is None:
         raise GknetError(f"frame {frame.name}: no keypoint is in view, so there is nothing to calibrate on")
     crop = Crop.around(box, bare.looking.input_size)
-    keypoints, attitude = bare.detect(check_image(frame.image), crop)
-    return Sight(replace(frame, image=None), box, crop, keypoints, crop.scale / stride, attitude)
+    keypoints, _ = bare.detect(check_image(frame.image), crop)
+    return Sight(replace(frame, image=None), box, crop, keypoints, crop.scale / stride)
 
 
 def calibrated(estimator: Estimator, sights: Sequence[Sight]) -> Estimator:

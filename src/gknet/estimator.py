@@ -46,11 +46,13 @@ class Estimator(CropEstimator):
 
     def estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box) -> Estimate:
         crop = Crop.around(box, self.looking.input_size)
-        first = self.pose_of(*self.detect(image, crop), camera, box, crop)
+        keypoints, attitude = self.detect(image, crop)
+        first = self.pose_of(keypoints, camera, box, crop, attitude)
         better_crop = self._better_crop(first, camera, crop)
         if better_crop is None:
             return first
-        second = self.pose_of(*self.detect(image, better_crop), camera, box, better_crop, trust_box=False)
+        keypoints, attitude = self.detect(image, better_crop)
+        second = self.pose_of(keypoints, camera, box, better_crop, attitude, trust_box=False)
         return second if _support(second) >= _support(first) else first
 
     def detect(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> tuple[Keypoints, Float32[ndarray, "k"] | None]:
@@ -82,15 +84,15 @@ class Estimator(CropEstimator):
     def pose_of(
         self,
         keypoints: Keypoints,
-        attitude: Float32[ndarray, "k"] | None,
         camera: Camera,
         box: Box,
         crop: Crop,
+        attitude: Float32[ndarray, "k"] | None = None,
         trust_box: bool = True,
     ) -> Estimate:
         """The pose that explains the keypoints (image pixels) seen in a crop, or why there is none.
 
-        attitude    the belief in it
+        attitude    the belief in its classes, seen in that crop
         trust_box   whether the box has a say; not one that the keypoints contradicted
         """
         measured = box if trust_box else None

@@ -36,7 +36,7 @@ class AttitudePrior(nn.Module):
 
     places      given as (k, n, cells, cells), `gknet.attitude.AttitudeBins.places`; kept as (n, cells cells, k)
     keypoints   (k, n, 2) the same without the blur, `AttitudeBins.keypoints`
-    gain     of what the attitude says, learnt; trust in what keypoints say, likewise: they err alike, so below 1
+    gain        of what the attitude says, learnt; trust in what keypoints say, likewise: they err alike, so below 1
     """
 
     places: Tensor
@@ -60,6 +60,9 @@ class AttitudePrior(nn.Module):
 
     def votes(self, attitude: Float[Tensor, "b k"], found: Float[Tensor, "b n 2"]) -> Float[Tensor, "b to from 2"]:
         """Where each keypoint must be by each other one: its place, and from there the way that the attitude tells.
+
+        attitude   logits of its classes
+        found      x and y of each keypoint's place, in fractions of the picture, as the votes are
 
         Ways are far surer than places: what is wrong with the crop, and much of what is with the attitude, is common to
         both ends of an edge.

@@ -19,7 +19,7 @@ from gknet.direct import DirectEstimator
 from gknet.errors import GknetError
 from gknet.estimator import Estimator
 from gknet.frame import Frame
-from gknet.locate import KeypointNetwork, Looking, Seen
+from gknet.locate import Looking, Seen
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 
@@ -39,17 +39,6 @@ def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray
         with torch.inference_mode():
             batch = torch.from_numpy(images).to(device).contiguous(memory_format=torch.channels_last)
             return network(batch).float().cpu().numpy()
-
-    return run
-
-
-def seeing(network: HeatmapNetwork, device: torch.device) -> KeypointNetwork:
-    """A torch network as the estimator by keypoints sees it."""
-
-    def run(images: Float32[ndarray, "b 3 s s"]) -> Seen:
-        with torch.inference_mode():
-            batch = torch.from_numpy(images).to(device).contiguous(memory_format=torch.channels_last)
-            return Seen(*[output.float().cpu().numpy() for output in network.seen(batch)])
 
     return run
 
@@ -95,7 +84,8 @@ def validate_keypoints(
     """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
     network.eval()
     looking = Looking(input_size=input_size)
-    bare = Estimator(seeing(network, device), spacecraft, looking=looking, decoding=BARE)
+    run = numpy_network(network, device)
+    bare = Estimator(lambda images: Seen(run(images)), spacecraft, looking=looking, decoding=BARE)
     sights = [sight(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
     try:
         estimator = calibrated(bare, sights)
