@@ -53,6 +53,9 @@ DIRECT = "DMANet"
 """It detects no keypoints: it is in table 2 alone, as in the paper."""
 GRAPHS = ("GKNet", "GKNet, no edges", "GKNet, random edges", "GKNet, no graph branch")
 
+METRICS = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
+"""What a trial knows of each frame, and what the graphs are compared by."""
+
 COSTS = ("parameters", "gmac", "ms", "learning_rate", "samples", "minutes", "curve")
 """What a result tells of its training, beside its trials."""
 
@@ -69,6 +72,9 @@ def read(folder: Path) -> tuple[Trials, dict[str, list[dict]]]:
             content = json.loads(path.read_text(encoding="utf-8"))
             for protocol, values in content.pop("protocols").items():
                 trial = Trial.from_dict(values)
+                unknown = [metric for metric in METRICS if metric not in trial.values]
+                if unknown:
+                    raise GknetError(f"no {', '.join(unknown)}")
                 trials[content["name"], trial.spacecraft, protocol].append(trial)
             missing = [key for key in COSTS if key not in content]
             if missing:
@@ -272,12 +278,11 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
         + rmse_table(trials, GRAPHS, "oracle", "rmse_low_px")
     )
     parts.append("## The skeleton less the other graphs, paired by frame\n")
-    metrics = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
-    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle")
+    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], METRICS, "oracle")
     parts.append(f"## Frames with a wrong attitude (E_q above {ATTITUDE_HOLDS_RAD} rad), ours, oracle crop\n")
     parts[-1] += graph_table(trials, wrong_attitudes)
     parts.append("## The skeleton less the other graphs, where the attitudes of both hold\n")
-    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], metrics, "oracle", attitudes_hold=True)
+    parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], METRICS, "oracle", attitudes_hold=True)
     parts.append(
         "## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + graph_table(trials, swaps)
     )

@@ -142,8 +142,8 @@ def card(models: Path, results: Path, name: str) -> str:
         "",
         "Never shown a real photograph. Made for spans of 8 to 90 % of a 1024 px frame; another camera works through",
         "its matrix, a span far outside that does not. A frame in which symmetric parts look the same can give a wrong",
-        "attitude with a small reprojection error; most of them have an attitude_belief below 0.8. Weights are stored",
-        "in 16 bits.",
+        "attitude with a small reprojection error; attitude_belief tells how likely that is, the table by it in the",
+        "README of the package how well. Weights are stored in 16 bits.",
         "Licence: Apache-2.0, as the package.",
     ]
     return "\n".join(lines) + "\n"

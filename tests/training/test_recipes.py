@@ -48,6 +48,18 @@ def test_a_result_without_its_curve(tmp_path: Path) -> None:
     assert said.count("\n") == 1
 
 
+def test_a_result_without_a_metric(tmp_path: Path) -> None:
+    kept = next((RECIPES.parent / "results" / "paper_tables" / "cpu").glob("satellite_*.json"))
+    content = json.loads(kept.read_text(encoding="utf-8"))
+    del content["protocols"]["oracle"]["values"]["e_q_rad"]
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "cpu" / kept.name).write_text(json.dumps(content))
+    said = refused("paper_report.py", "--results", tmp_path)
+    assert f"{kept.name}: not a result" in said
+    assert "no e_q_rad" in said
+    assert said.count("\n") == 1
+
+
 def test_a_score_that_is_none(tmp_path: Path) -> None:
     work, sweep = tmp_path / "work" / "cpu", tmp_path / "results" / "cpu" / "sweep"
     work.mkdir(parents=True)
