@@ -24,6 +24,7 @@ from gknet.training.schedule import Stage  # noqa: E402
 
 CRAFT = "satellite_01"
 STAGES = (Stage(1.0, 64, 4),)
+SEED = 5
 RECIPES_FOLDER = Path(__file__).parents[2] / "recipes"
 
 
@@ -66,18 +67,20 @@ def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
     scale = replace(
         recipe.SCALES["cpu"], first_minutes=0.05, keypoint_minutes=(0.05,), locator_minutes=0.05, stages=STAGES
     )
-    recipe.train_all(work, scale, None)
+    recipe.train_all(work, scale, None, SEED)
     recipe.ship(work, work / "models", None)
     assert load_estimator(work / "models" / CRAFT).locator is not None
     assert not list((work / "blended").glob("first*"))
 
     run = f"{CRAFT}_keypoints"
-    chosen = json.loads((work / "blended" / run / "run.json").read_text())["best"]
+    record = json.loads((work / "blended" / run / "run.json").read_text())
+    chosen = record["best"]
+    assert record["settings"]["seed"] == SEED
     before, after = load_weights(work / "runs" / "first" / BEST), load_weights(work / "runs" / run / BEST)
     blended = load_weights(work / "blended" / run / BEST)
     for name, expected in recipe.mean(before, after, chosen["share"]).items():
         torch.testing.assert_close(blended[name], expected)
-    job = next(job for job in recipe.jobs(work, scale, None) if job.run == run)
+    job = next(job for job in recipe.jobs(work, scale, None, SEED) if job.run == run)
     assert scores_of(recipe.blend(job), recipe) is None  # done before, so left alone
     shutil.rmtree(work / "blended" / run)
     scores = scores_of(recipe.blend(job), recipe)
@@ -96,7 +99,7 @@ def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: Modu
     other = {name: weight for name, weight in initial(work).items() if not name.startswith("decoder")}
     save_weights(start / CRAFT / "keypoints.safetensors", other, {})
     kinds = ("keypoints",)
-    [job] = recipe.jobs(work, scale, start, kinds)
+    [job] = recipe.jobs(work, scale, start, SEED, kinds)
     recipe.run(job)
     assert list(scores_of(recipe.blend(job), recipe) or {}) == [1.0]
     recipe.ship(work, work / "models", start, kinds)
