@@ -28,6 +28,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import shutil
 import time
 from collections.abc import Iterator
@@ -42,7 +43,7 @@ from gknet.atomic import write_text
 from gknet.comparison import Trial
 from gknet.dataset.skd import SkdDataset
 from gknet.direct import DirectEstimator
-from gknet.errors import GknetError, ends_in_one_line
+from gknet.errors import DivergedError, GknetError, ends_in_one_line
 from gknet.estimator import load_estimator
 from gknet.evaluation import Run, evaluate
 from gknet.fleet import NAMES
@@ -80,7 +81,7 @@ class Scale:
     sequences, size                      of the data; None renders all, whole
     seeds                                of each method
     ablation_seeds                       of gknet with its skeleton and without edges, on ABLATED
-    rates                                learning rates tried for each method on SWEPT, sweep_epochs each
+    rates                                learning rates tried first for each method on SWEPT, sweep_epochs each
     """
 
     methods: tuple[Method, ...]
@@ -98,6 +99,8 @@ class Scale:
 
 
 SWEPT = "satellite_02"
+TRIES = 6
+"""Of learning rates at most, for each method."""
 ABLATED = ("satellite_02", "satellite_03")
 
 
@@ -125,6 +128,7 @@ PAPER = TrainSettings(
     weight_decay=0.0,  # AdamW without decay is Adam
     warm_up=0.0,
     cycles=5,
+    auxiliary=0.0,
     ema=0.0,
     validations=10,
 )
@@ -172,12 +176,13 @@ def main() -> None:
     wait_for(rendered)
     (results / "sweep").mkdir(parents=True, exist_ok=True)
     swept = SWEPT if SWEPT in arguments.spacecraft else arguments.spacecraft[0]
-    sweep = [(method.network, rate) for method in scale.methods for rate in scale.rates if len(scale.rates) > 1]
-    for network, rate in sweep[share::shares]:
-        try_rate(work, results, scale, network, rate, swept)
-    rates = {method.network: best_rate(results, scale, method.network) for method in scale.methods}
-    todo = [trial for trial in trials(scale, arguments.spacecraft) if not result_path(results, *trial).exists()]
-    for method, spacecraft, seed in todo[share::shares]:
+    networks = [method.network for method in scale.methods]
+    mine = networks[share::shares]
+    mine_first = sorted(networks, key=lambda network: network not in mine)
+    rates = {network: chosen_rate(work, results, scale, network, swept, network in mine) for network in mine_first}
+    for method, spacecraft, seed in list(trials(scale, arguments.spacecraft))[share::shares]:
+        if result_path(results, method, spacecraft, seed).exists():
+            continue
         settings = replace(
             scale.settings,
             network=method.network,
@@ -213,37 +218,53 @@ def wait_for(path: Path) -> None:
         time.sleep(5)
 
 
-def sweep_path(results: Path, network: str, rate: float) -> Path:
-    return results / "sweep" / f"{network}_{rate:g}.json"
+def sweep_path(results: Path, spacecraft: str, network: str, rate: float) -> Path:
+    return results / "sweep" / f"{spacecraft}_{network}_{rate:g}.json"
 
 
 def try_rate(work: Path, results: Path, scale: Scale, network: str, rate: float, spacecraft: str) -> None:
-    """A short training; every method has the same number of them."""
-    path = sweep_path(results, network, rate)
-    if path.exists():
-        return
+    """A short training; a rate at which it diverges has no score."""
     settings = replace(
         scale.settings, network=network, epochs=scale.sweep_epochs, learning_rate=rate, seed=SWEEP_SEED, validations=1
     )
-    run = work / "runs" / f"sweep_{network}_{rate:g}"
-    minutes = run_training(work, spacecraft, run, settings)
-    best = json.loads((run / "run.json").read_text(encoding="utf-8"))["best"]
-    write_text(path, json.dumps({"spacecraft": spacecraft, "minutes": minutes, **best}) + "\n")
+    run = work / "runs" / f"sweep_{spacecraft}_{network}_{rate:g}"
+    try:
+        minutes = run_training(work, spacecraft, run, settings)
+        content = {"minutes": minutes, **json.loads((run / "run.json").read_text(encoding="utf-8"))["best"]}
+    except DivergedError:
+        content = {"score": None}
+    write_text(sweep_path(results, spacecraft, network, rate), json.dumps({"spacecraft": spacecraft, **content}) + "\n")
 
 
-def best_rate(results: Path, scale: Scale, network: str) -> float:
-    """The learning rate of the lowest validation score."""
-    if len(scale.rates) == 1:
-        return scale.rates[0]
-    scores = {}
-    for rate in scale.rates:
-        path = sweep_path(results, network, rate)
-        wait_for(path)
-        try:
-            scores[rate] = float(json.loads(path.read_text(encoding="utf-8"))["score"])
-        except (OSError, ValueError, LookupError, TypeError) as error:
-            raise GknetError(f"{path}: not a score of the sweep ({error}); delete it and run again") from error
-    return min(scores, key=lambda rate: scores[rate])
+def chosen_rate(work: Path, results: Path, scale: Scale, network: str, spacecraft: str, mine: bool) -> float:
+    """The learning rate of the lowest validation score; beyond the best one are a half and twice of it, tried as well.
+
+    mine  whether this share makes what is missing, or waits for it
+    """
+    rates = sorted(scale.rates)
+    scores: dict[float, float] = {}
+    while len(rates) > 1:
+        for rate in rates:
+            if rate not in scores:
+                path = sweep_path(results, spacecraft, network, rate)
+                if mine and not path.exists():
+                    try_rate(work, results, scale, network, rate, spacecraft)
+                wait_for(path)
+                scores[rate] = score_of(path)
+        best = min(rates, key=lambda rate: scores[rate])
+        if best not in (rates[0], rates[-1]) or len(rates) == TRIES:
+            return best
+        rates = [best / 2, *rates] if best == rates[0] else [*rates, best * 2]
+    return rates[0]
+
+
+def score_of(path: Path) -> float:
+    """Of a rate that was tried; infinite where the training diverged."""
+    try:
+        score = json.loads(path.read_text(encoding="utf-8"))["score"]
+        return math.inf if score is None else float(score)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise GknetError(f"{path}: not a score of the sweep ({error}); delete it and run again") from error
 
 
 def trials(scale: Scale, spacecraft: list[str]) -> Iterator[tuple[Method, str, int]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gknet.comparison import LOW_VISIBILITY, Trial, difference, mean_of, where_attitudes_hold
+from gknet.comparison import LOW_VISIBILITY, Trial, _draws, difference, mean_of, seeds_agree, where_attitudes_hold
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.evaluation import evaluate
@@ -75,10 +75,37 @@ def test_seeds_that_disagree_widen_the_interval() -> None:
     assert disagreeing.high - disagreeing.low > 3 * (agreeing.high - agreeing.low)
 
 
+def test_resamples_of_few_have_their_whole_variance() -> None:
+    """The mean of n values has the variance s^2 / n; n draws of them would show (n - 1) / n of it."""
+    shifts = np.array([-3.0, 1.0, 4.0])
+    for draws in _draws(3, 3, seed=0, resamples=40_000):
+        means = draws @ shifts / draws.sum(axis=1)
+        assert means.var() == pytest.approx(shifts.var(ddof=1) / 3, rel=0.03)
+
+
+def test_seeds_may_disagree() -> None:
+    base = np.random.default_rng(4).normal(20, 5, 100)
+    first = [trial("a", base, 0), trial("a", base, 1)]
+    assert seeds_agree(first, [trial("b", base + 1, 0), trial("b", base + 3, 1)], "rmse_px")
+    assert not seeds_agree(first, [trial("b", base + 1, 0), trial("b", base - 0.1, 1)], "rmse_px")
+
+
+def test_a_resample_without_a_known_value_is_left_out() -> None:
+    values = np.full(200, np.nan)
+    values[[5, 15]] = 30, 31
+    found = mean_of([trial("a", values)], "rmse_px")
+    assert found.low >= 30
+    gap = difference([trial("a", values)], [trial("b", values + 10)], "rmse_px")
+    assert gap.low == pytest.approx(-10)
+    assert gap.high == pytest.approx(-10)
+
+
 def test_different_frames_are_not_compared() -> None:
     values = np.arange(20.0)
     with pytest.raises(GknetError, match="different frames"):
         difference([trial("a", values)], [trial("b", values[:10])], "rmse_px")
+    with pytest.raises(GknetError, match="different frames"):
+        where_attitudes_hold([trial("a", values)], [trial("b", values[:10])])
     with pytest.raises(GknetError, match="at least one"):
         mean_of([], "rmse_px")
     with pytest.raises(GknetError, match="no frame"):
@@ -113,3 +140,5 @@ def test_a_trial_says_what_its_run_measured(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.isnan(values["rmse_low_px"]), [True, False, True])
     assert values["rmse_low_px"][1] == values["rmse_px"][1] == veiled.errors.rmse_px
     np.testing.assert_allclose(values["swapped"], [2 / (~np.isnan(clear.keypoint_px)).sum(), 0, 0])
+    lost = replace(clear, estimate=replace(clear.estimate, keypoints=None))
+    assert np.isnan(Trial.of(replace(run, cases=(lost,)), "a", "toy", 0).values["swapped"]).all()

@@ -202,15 +202,6 @@ def test_a_good_box_needs_one_look() -> None:
     assert estimator.keypoint_network.calls == 1
 
 
-def test_a_small_spacecraft_is_located_twice_when_asked() -> None:
-    estimator, frame = perfect(POSES["far"], relook_below=0.3)
-    box, truth = estimator.locate(frame.image), frame.true_box(POINTS)
-    assert estimator.locator.calls == 2
-    assert box is not None
-    assert truth is not None
-    assert box.iou(truth) > 0.97
-
-
 def test_same_image_same_estimate() -> None:
     estimator, frame = perfect(POSES["middle"])
     first, second = (estimator.estimate(frame.image, CAMERA) for _ in range(2))

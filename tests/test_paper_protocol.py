@@ -29,6 +29,14 @@ def test_the_highest_cell_of_fine_heatmaps_is_one_of_32() -> None:
         highest_cells(np.zeros((2, 48, 48)), 256)
 
 
+def test_a_smaller_input_has_as_many_cells() -> None:
+    """And heatmaps of fewer are read as they are."""
+    heatmaps = np.zeros((1, 32, 32))
+    heatmaps[0, 5, 7] = 1.0
+    np.testing.assert_array_equal(highest_cells(heatmaps, 128), [[30, 22]])
+    np.testing.assert_array_equal(highest_cells(heatmaps[:, :16, :16], 64), [[30, 22]])
+
+
 def test_plain_pnp_is_exact_on_exact_points_and_has_no_defence() -> None:
     pixels = CAMERA.project(POSE.transform(POINTS))
     found = plain_pnp(pixels, CAMERA, POINTS)

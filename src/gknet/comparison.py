@@ -1,7 +1,9 @@
 """Methods against each other on the same frames: means and paired differences with their intervals.
 
 A `Trial` is one trained network judged on the test frames. Intervals are bootstrapped over sequences, the frames of
-which are alike, and over seeds, which are few: both are drawn with replacement, the same draw for both methods.
+which are alike, and over seeds, which are few: of n of them n - 1 are drawn with replacement, since n would hide a part
+1/n of the variance (Rao and Wu 1988), the same draw for both methods. One seed says nothing of the luck of a training,
+and with two or three the interval is still too short: see whether the seeds agree.
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ LOW_VISIBILITY = 0.6
 
 ATTITUDE_HOLDS_RAD = 0.35
 """E_q (20 degrees) beyond which an attitude is wrong as a whole, a twin's or a guess, and not just inexact."""
+
+
+class NothingKnownError(GknetError):
+    """A metric that no frame of a trial has, as of hidden keypoints where none is hidden."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +98,8 @@ def measured(case: Case) -> dict[str, float | None]:
 
     rmse_px, rmse_hidden_px, e_t, e_q_rad   as in `gknet.metrics.FrameErrors`
     rmse_low_px   rmse_px of a frame of low visibility
-    swapped       share of the keypoints in view that were detected at another one's place (`taken_for`)
+    swapped       share of the keypoints in view that were detected at another one's place (`taken_for`); None where
+                  nothing was detected
     """
     errors = case.errors
     low = errors.visible_fraction is not None and errors.visible_fraction < LOW_VISIBILITY
@@ -104,7 +111,7 @@ def measured(case: Case) -> dict[str, float | None]:
         "e_t": errors.e_t,
         "e_q_rad": errors.e_q_rad,
         "rmse_low_px": errors.rmse_px if low else None,
-        "swapped": elsewhere.sum() / in_view if in_view else None,
+        "swapped": elsewhere.sum() / in_view if in_view and case.estimate.keypoints is not None else None,
     }
 
 
@@ -145,6 +152,15 @@ def difference(
     return Interval(float(means[0] - means[1]), *_ends(gap))
 
 
+def seeds_agree(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> bool:
+    """Whether each seed by itself puts the same method ahead."""
+    ahead = {
+        np.sign(np.nanmean(one.values[metric]) - np.nanmean(other.values[metric]))
+        for one, other in zip(first, second, strict=True)
+    }
+    return len(ahead) == 1
+
+
 def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
     """Both methods, seed by seed, on the frames in which the attitudes of both hold; the other values are NaN."""
 
@@ -153,6 +169,8 @@ def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tup
 
     pairs = []
     for one, other in zip(first, second, strict=True):
+        if one.frames != other.frames:
+            raise GknetError(f"comparison: {one.method} and {other.method} were judged on different frames")
         known = np.maximum(one.values["e_q_rad"], other.values["e_q_rad"]) <= ATTITUDE_HOLDS_RAD
         pairs.append((masked(one, known), masked(other, known)))
     return [one for one, _ in pairs], [other for _, other in pairs]
@@ -176,24 +194,27 @@ def _by_sequence(
         sums[row] = np.bincount(place[known], weights=trial.values[metric][known], minlength=len(names))
         counts[row] = np.bincount(place[known], minlength=len(names))
     if counts.sum() == 0:
-        raise GknetError(f"comparison: no frame of {trials[0].method} has the metric {metric}")
+        raise NothingKnownError(f"comparison: no frame of {trials[0].method} has the metric {metric}")
     return sums, counts
 
 
 def _draws(seeds: int, sequences: int, seed: int, resamples: int) -> tuple[ndarray, ndarray]:
     """How often each resample holds each sequence (r, sequences), and each seed (r, seeds)."""
     rng = np.random.default_rng(seed)
-    return (
-        rng.multinomial(sequences, np.full(sequences, 1 / sequences), size=resamples),
-        rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples),
-    )
+
+    def drawn(count: int) -> ndarray:
+        return rng.multinomial(max(count - 1, 1), np.full(count, 1 / count), size=resamples)
+
+    return drawn(sequences), drawn(seeds)
 
 
 def _resampled(sums: ndarray, counts: ndarray, sequences: ndarray, seeds: ndarray) -> Float[ndarray, "r"]:
+    """The mean of each resample; NaN of one in which nothing is known."""
     top = np.einsum("rk,ks,rs->r", seeds, sums, sequences)
-    return top / np.maximum(np.einsum("rk,ks,rs->r", seeds, counts, sequences), 1e-9)
+    known = np.einsum("rk,ks,rs->r", seeds, counts, sequences)
+    return np.divide(top, known, out=np.full(len(top), np.nan), where=known > 0)
 
 
 def _ends(values: Float[ndarray, "r"]) -> tuple[float, float]:
-    low, high = np.percentile(values, (2.5, 97.5))
+    low, high = np.nanpercentile(values, (2.5, 97.5))
     return float(low), float(high)

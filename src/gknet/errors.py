@@ -14,6 +14,10 @@ class GknetError(Exception):
     """
 
 
+class DivergedError(GknetError):
+    """A training whose loss is no number any more."""
+
+
 class MissingExtraError(GknetError):
     """An optional part of gknet was asked for that is not installed."""
 

@@ -194,6 +194,8 @@ def taken_for(
 ) -> Int[ndarray, "n"]:
     """For each keypoint in view, the true keypoint that its detection lies at; -1 for none, and out of view.
 
+    What has no peak (score 0) is no detection.
+
     Within SWAP_PX of its own (pixels of the 256 oracle crop) it is itself; else the nearest other one within SWAP_PX.
     """
     count = len(true_px)
@@ -203,7 +205,7 @@ def taken_for(
     distance[:, ~in_view] = np.inf
     own = np.arange(count)
     taken = np.where(np.diag(distance) < SWAP_PX, own, distance.argmin(axis=1))
-    return np.where(in_view & (distance[own, taken] < SWAP_PX), taken, -1)
+    return np.where(in_view & (keypoints.score > 0) & (distance[own, taken] < SWAP_PX), taken, -1)
 
 
 def confusion(run: Run) -> Int[ndarray, "n n"]:

@@ -91,9 +91,11 @@ class Frame:
         return self.camera.project(self.cam_from_body.transform(points_m))
 
     def true_box(self, points_m: Float[ndarray, "n 3"]) -> Box | None:
-        """The box of the true keypoints inside the image (the oracle's crop), None when none is inside."""
-        box = Box.around(self.keypoints_px(points_m))
-        return box.clipped(self.camera.width, self.camera.height)
+        """The part inside the image of the true keypoints' box (the oracle's crop), None when no keypoint is inside."""
+        pixels = self.keypoints_px(points_m)
+        if not self.camera.contains(pixels).any():
+            return None
+        return Box.around(pixels).clipped(self.camera.width, self.camera.height)
 
     @property
     def range_m(self) -> float | None:

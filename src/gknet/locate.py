@@ -45,7 +45,6 @@ class Looking:
     input_size     side of the input of the network that looks into the crop, in pixels
     locator_size   side of the locator's
     min_located    the locator's peak below which there is no spacecraft
-    relook_below   a first box smaller than this part of the locator's view is located again in a crop about it
     refine_crop    look once more where the keypoints say that the crop was off ...
     refine_iou     ... which is when the two crops overlap less than this
     turns          orientations, of 1, 2 or 4, in which a keypoint network sees the crop; it believes their mean
@@ -54,7 +53,6 @@ class Looking:
     input_size: int = 256
     locator_size: int = 256
     min_located: float = 0.1
-    relook_below: float = 0.0
     refine_crop: bool = True
     refine_iou: float = 0.75
     turns: int = 1
@@ -120,10 +118,7 @@ class CropEstimator(ABC):
         height, width = image.shape[:2]
         side = max(width, height)
         whole = Crop((width - side) // 2, (height - side) // 2, side, self.looking.locator_size)
-        box = self._locate_in(image, whole)
-        if box is None or box.side >= self.looking.relook_below * side:
-            return box
-        return self._locate_in(image, Crop.around(box, self.looking.locator_size, margin=3)) or box
+        return self._locate_in(image, whole)
 
     def contradiction(self, cam_from_body: Pose, camera: Camera, crop: Crop) -> str | None:
         """Why a pose cannot belong to the crop that it was found in; None when it can."""

@@ -133,7 +133,11 @@ def errors(
 
 
 def keypoint_errors_px(keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], crop: Crop) -> Float[ndarray, "n"]:
-    """Distances in pixels of the oracle crop. A keypoint that was not detected at all is off by the crop's diagonal."""
+    """Distances in pixels of the oracle crop.
+
+    Where nothing was detected, as in a picture without a box, every keypoint is off by the crop's diagonal. One whose
+    heatmap has no peak (score 0) counts at the centre of the input, where `decode_heatmaps` puts it.
+    """
     missing = crop.size * np.sqrt(2)
     if keypoints is None:
         return np.full(len(true_px), missing)

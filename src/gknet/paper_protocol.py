@@ -19,8 +19,8 @@ from gknet.geometry import Camera, Pose
 from gknet.locate import KeypointNetwork, check_image, network_input
 from gknet.spacecraft import Spacecraft
 
-STRIDE = 8
-"""Input pixels per cell, 32x32 cells at 256x256; finer heatmaps are averaged down to it."""
+CELLS = 32
+"""On a side of the paper's heatmaps; finer ones are averaged down to it, coarser ones are read as they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,14 @@ class PaperEstimator:
 
 
 def highest_cells(heatmaps: Float[ndarray, "n h w"], input_size: int) -> Float[ndarray, "n 2"]:
-    """Eq. 5: the centre of the highest cell of STRIDE input pixels, in pixels of the network's input."""
+    """Eq. 5: the centre of the highest of CELLS x CELLS cells, in pixels of the network's input."""
     count, side, _ = heatmaps.shape
-    cells = input_size // STRIDE
+    cells = min(CELLS, side)
     if side % cells:
         raise GknetError(f"the paper's protocol: expected heatmaps of {cells} cells or a multiple, got {side}")
     pooled = heatmaps.reshape(count, cells, side // cells, cells, side // cells).mean(axis=(2, 4))
     row, column = np.divmod(pooled.reshape(count, -1).argmax(axis=1), cells)
-    return (np.stack([column, row], axis=1) + 0.5) * STRIDE
+    return (np.stack([column, row], axis=1) + 0.5) * input_size / cells
 
 
 def plain_pnp(pixels: Float[ndarray, "n 2"], camera: Camera, points_m: Float[ndarray, "n 3"]) -> Pose | None:

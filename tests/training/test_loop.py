@@ -103,6 +103,9 @@ def test_a_run_is_not_overwritten_and_not_confused(data: Path, finished: Path, t
         train(data, "satellite_01", finished, SETTINGS, quiet=True)
     with pytest.raises(GknetError, match="another training"):
         train(data, "satellite_01", finished, replace(SETTINGS, network="locator"), resume=True, quiet=True)
+    for other in ({"graph": "identity"}, {"loss": "squared"}):  # the weights would fit
+        with pytest.raises(GknetError, match="another training"):
+            train(data, "satellite_01", finished, replace(SETTINGS, **other), resume=True, quiet=True)
     with pytest.raises(GknetError, match="no checkpoint"):
         train(data, "satellite_01", tmp_path, SETTINGS, resume=True, quiet=True)
     (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")

@@ -6,12 +6,17 @@ import json
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("torch")
+pytest.importorskip("lightning_fabric")
 pytest.importorskip("mitsuba")
+
+from gknet.errors import DivergedError
+from gknet.training.settings import TrainSettings
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 
@@ -66,13 +71,58 @@ def test_a_score_that_is_none(tmp_path: Path) -> None:
     sweep.mkdir(parents=True)
     (work / "rendered_satellite_02").touch()
     scale = runpy.run_path(str(RECIPES / "paper_tables.py"))["SCALES"]["cpu"]
-    names = [f"{method.network}_{rate:g}.json" for method in scale.methods for rate in scale.rates]
+    names = [f"satellite_02_{method.network}_{rate:g}.json" for method in scale.methods for rate in scale.rates]
     for name in names:
         (sweep / name).write_text("{}")
     folders = ("--work", tmp_path / "work", "--results", tmp_path / "results")
     said = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
     assert f"{names[0]}: not a score" in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("scores", "chosen"),
+    [
+        ({1.5e-3: 31, 3e-3: 30, 6e-3: 35}, 3e-3),
+        ({3e-3: 36, 6e-3: 35, 1.2e-2: 33, 2.4e-2: None}, 1.2e-2),
+        ({7.5e-4: 40, 1.5e-3: 38, 3e-3: 39, 6e-3: None}, 1.5e-3),
+        ({3e-3: 36, 6e-3: 35, 1.2e-2: 34, 2.4e-2: 33, 4.8e-2: 32, 9.6e-2: 31}, 9.6e-2),  # enough is enough
+    ],
+)
+def test_a_sweep_goes_on_until_its_best_lies_inside(
+    scores: dict[float, float | None], chosen: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every rate that it tries is among `scores`, each once; a diverged one has none."""
+    monkeypatch.syspath_prepend(str(RECIPES))
+    import paper_tables
+
+    scale, left = paper_tables.SCALES["cpu"], dict(scores)
+    (tmp_path / "sweep").mkdir()
+
+    def training(work: Path, spacecraft: str, run: Path, settings: TrainSettings) -> float:
+        score = left.pop(round(settings.learning_rate, 6))
+        if score is None:
+            raise DivergedError("the loss became nan")
+        run.mkdir(parents=True)
+        (run / "run.json").write_text(json.dumps({"best": {"score": score}}))
+        return 1.0
+
+    monkeypatch.setattr(paper_tables, "run_training", training)
+    for mine in (True, False):  # another share reads the same
+        rate = paper_tables.chosen_rate(tmp_path / "work", tmp_path, scale, "hrnet-xs", "satellite_02", mine)
+        assert rate == pytest.approx(chosen)
+    assert not left
+
+
+def test_the_papers_training_has_the_papers_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eq. 4 alone, of the fused maps, by Adam."""
+    monkeypatch.syspath_prepend(str(RECIPES))
+    import paper_tables
+
+    settings = paper_tables.SCALES["full"].settings
+    assert (settings.auxiliary, settings.weight_decay, settings.ema, settings.optimizer) == (0, 0, 0, "adamw")
+    for method in paper_tables.SCALES["full"].methods[:3]:
+        assert replace(settings, network=method.network).chosen_loss == "squared"
 
 
 @pytest.mark.parametrize("share", ["2/2", "-1/2", "1", "a/b", "0/0"])

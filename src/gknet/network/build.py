@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import TypeVar
-
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
@@ -38,17 +34,6 @@ OWN_LOSS_NETWORKS = ("dmanet", "dmanet-xs", "locator")
 
 PAPER_STRIDE = 8
 """The paper holds every method to heatmaps of 32x32 at 256x256."""
-
-Config = TypeVar("Config", GKNetConfig, GKNetPaperConfig, HRNetConfig, ResUNetConfig, DMANetConfig, LocatorConfig)
-
-
-def configured(config: type[Config], values: Mapping[str, object]) -> Config:
-    """A configuration from plain values; a key that it does not know is an error."""
-    known = [field.name for field in fields(config)]
-    for key in values:
-        if key not in known:
-            raise GknetError(f"{config.__name__}: unknown key '{key}'; expected some of {', '.join(known)}")
-    return config(**values)  # type: ignore[arg-type]
 
 
 def gknet_s(

@@ -1,8 +1,12 @@
-"""GKNet at the paper's own sizes: a U-Net of base width 64 decoded to full size, 32x32 heatmaps.
+"""GKNet as the paper describes it, as large as the authors' (about 90 M): a U-Net decoded to full size, 32x32 heatmaps.
 
 Where the paper is silent we chose: channels 64 to 1024 with two 3x3 convolutions a level, skips at every level, an
 8x8 convolution of stride 8 from F' to F'', three graph layers of 512 channels, and C_out = H W, so that a node's
 output is its keypoint's map.
+
+The paper makes the nodes of F by one reshaping, which fixes their number, and takes the linear layer behind eq. 2 from
+GraphCape. From there we took the nodes themselves too: one learned query for each keypoint, which attends to the cells
+of F (with their places) before each graph layer; residuals and LayerNorms about both. W_adj has a bias.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ class GraphLayer(nn.Module):
 
     The edges are the only way from node to node, so that an ablation of the edges is one of the graph.
     With a width of glances, nodes say in between where they believe their keypoints to be and see what is there, and
-    messages know both ends; without one (0) the layer is the paper's.
+    messages know both ends; without one (0) messages are those of eq. 2.
     """
 
     def __init__(

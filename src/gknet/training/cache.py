@@ -112,8 +112,8 @@ def cached_row(frame: Frame, spacecraft: Spacecraft, window: Window, size: int) 
     points_m = spacecraft.points_m
     pixels = frame.keypoints_px(points_m)
     inside = frame.camera.contains(pixels)
-    box = frame.true_box(points_m) if np.isfinite(pixels).any() else None
-    if box is None or not inside.any():
+    box = frame.true_box(points_m)
+    if box is None:
         return None
     crop = craft_window(frame, box, size) if window == "craft" else whole_picture(frame, size)
     points = crop.to_input(pixels)

@@ -15,7 +15,7 @@ import torch
 
 from gknet import __version__
 from gknet.dataset.skd import SkdDataset
-from gknet.errors import GknetError
+from gknet.errors import DivergedError, GknetError
 from gknet.network.build import build
 from gknet.network.locator import Locator
 from gknet.spacecraft import spacecraft_toml
@@ -83,7 +83,8 @@ def train(
     if not isinstance(network, Locator):
         model.mark_forward_method("branches")
 
-    identity = f"{settings.network}, {spacecraft.name} with {spacecraft.keypoint_count} keypoints, seed {settings.seed}"
+    kind = f"{settings.network} ({settings.graph}, {settings.chosen_loss})"
+    identity = f"{kind}, {spacecraft.name} with {spacecraft.keypoint_count} keypoints, seed {settings.seed}"
     state = load_checkpoint(out, network, average, optimizer, identity) if resume else State()
     toml = spacecraft_toml(replace(spacecraft, mesh_path=None))
     run = Run(
@@ -149,7 +150,7 @@ def train(
                 progress = budget.progress(state.samples, state.elapsed_s)
                 losses.append(loss.item())
                 if not math.isfinite(losses[-1]):
-                    raise GknetError(f"train: the loss became {losses[-1]} after {state.steps} steps; lower --lr")
+                    raise DivergedError(f"train: the loss became {losses[-1]} after {state.steps} steps; lower --lr")
                 looking = math.floor(progress * settings.validations) > math.floor(before * settings.validations)
                 if looking or state.steps % REPORT_STEPS == 0:
                     row = {

@@ -18,7 +18,7 @@ QUINTIC = (3.4445, -4.7750, 2.0315)
 ROUNDS = 5
 RMS = 0.2
 """Of an update over its learning rate: about what AdamW's is, so that one learning rate serves both (Liu 2025)."""
-SMALLEST = 16
+SMALLEST = 8
 """A matrix with fewer rows or columns has few directions to balance: AdamW takes it."""
 
 
