@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,5 +42,7 @@ def test_a_swap_is_near_another_keypoint_and_far_from_its_own() -> None:
     # right; at 0 instead of 1; within 10 px of its own, though nearer to another; nowhere; out of view
     assert taken_for(keypoints, true_px, in_view, crop).tolist() == [0, 0, 2, -1, -1]
     assert taken_for(None, true_px, in_view, crop).tolist() == [-1] * 5
+    without_peak = replace(keypoints, score=np.array([1, 0, 1, 1, 1.0]))
+    assert taken_for(without_peak, true_px, in_view, crop).tolist() == [0, -1, 2, -1, -1]
     small = Crop(0, 0, 1024, 256)  # four image pixels are one of the crop: all is nearer
     assert taken_for(keypoints, true_px, in_view, small).tolist() == [0, 1, 2, -1, -1]

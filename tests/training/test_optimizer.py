@@ -82,7 +82,9 @@ def test_every_weight_is_trained_once(name: str) -> None:
     held = [id(parameter) for group in optimizer.param_groups for parameter in group["params"]]
     assert sorted(held) == sorted(id(parameter) for parameter in network.parameters())
     large = [p for group in optimizer.param_groups if group["matrices"] for p in group["params"]]
-    assert sum(p.numel() for p in large) > 0.8 * sum(p.numel() for p in network.parameters())
+    left = [p for group in optimizer.param_groups if not group["matrices"] for p in group["params"] if p.ndim > 1]
+    assert all(min(len(p), p[0].numel()) < 8 for p in left)  # the finest maps of hrnet-xs: each method by one rule
+    assert sum(p.numel() for p in large) > 0.9 * sum(p.numel() for p in network.parameters())
     for group in optimizer.param_groups:
         assert all((parameter.ndim > 1) == (group["weight_decay"] > 0) for parameter in group["params"])
 
