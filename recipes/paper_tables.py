@@ -14,8 +14,9 @@ DMANet tells the pose directly: it has its own loss, no heatmaps, and so not the
 
 Hardware   cpu: 2 cores; two shares in two terminals, each with OMP_NUM_THREADS=1, are faster than one run (--share 0/2
            and --share 1/2)
-Time       cpu: about 6 hours of two cores without bfloat16, estimated from what was run: rendering 13 minutes a
-           spacecraft, a training 12 to 25 minutes of one core, with another one on the other; full: not run
+Time       cpu: about 5 hours of two cores with bfloat16, added up from what was run: rendering 13 minutes a
+           spacecraft, a sweep 12 to 40 minutes, a training 8 (ResUNet) to 20 (DMANet) minutes of one core, with another
+           one on the other; up to twice as long without bfloat16; full: not run
 Expected   one small JSON for each training in RESULTS/SCALE, which paper_report.py turns into tables
 
 What is done is kept: stop it at any time and run it again. Only train sequences are trained on; validation chooses
