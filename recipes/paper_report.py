@@ -195,7 +195,7 @@ def cost_table(costs: dict[str, list[dict]]) -> str:
                 f"{one['parameters'] / 1e6:.2f} M",
                 f"{one['gmac']:.3f}",
                 f"{np.median([content['ms'] for content in found]):.1f}",
-                f"{one['learning_rate']:g}",
+                ", ".join(f"{rate:g}" for rate in sorted({content["learning_rate"] for content in found})),
                 str(one["samples"]),
                 f"{np.mean(minutes):.1f}",
                 str(len(found)),
