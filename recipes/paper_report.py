@@ -26,7 +26,7 @@ from gknet.comparison import (
     Trial,
     difference,
     mean_of,
-    seeds_agree,
+    seed_gaps,
     where_attitudes_hold,
 )
 from gknet.errors import GknetError, ends_in_one_line
@@ -157,11 +157,14 @@ def difference_row(
         try:
             gap = difference(ours, theirs, metric)
             part = 100 * gap.mean / mean_of(theirs, metric).mean
-            sure = gap.excludes_zero and seeds_agree(ours, theirs, metric)
+            each = seed_gaps(ours, theirs, metric)
         except NothingKnownError:
             row.append("-")
             continue
-        words = f"{shown(gap)}, {part:+.0f} %, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+        words = f"{shown(gap)}, {part:+.0f} %, 1 seed"
+        if len(each) > 1:
+            words = f"{shown(gap)}, {part:+.0f} %, {len(each)} seeds: {', '.join(f'{value:.2g}' for value in each)}"
+        sure = gap.excludes_zero and len(set(np.sign(each))) == 1
         row.append(f"**{words}**" if sure else words)
     return row
 

@@ -263,6 +263,8 @@ def score_of(path: Path) -> float:
     """Of a rate that was tried; infinite where the training diverged."""
     try:
         score = json.loads(path.read_text(encoding="utf-8"))["score"]
+        if score is not None and math.isnan(score):
+            raise ValueError("NaN")
         return math.inf if score is None else float(score)
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise GknetError(f"{path}: not a score of the sweep ({error}); delete it and run again") from error

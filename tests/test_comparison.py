@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gknet.comparison import LOW_VISIBILITY, Trial, _draws, difference, mean_of, seeds_agree, where_attitudes_hold
+from gknet.comparison import LOW_VISIBILITY, Trial, _draws, difference, mean_of, seed_gaps, where_attitudes_hold
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.evaluation import evaluate
@@ -83,11 +83,13 @@ def test_resamples_of_few_have_their_whole_variance() -> None:
         assert means.var() == pytest.approx(shifts.var(ddof=1) / 3, rel=0.03)
 
 
-def test_seeds_may_disagree() -> None:
+def test_each_seed_has_a_gap_of_its_own() -> None:
     base = np.random.default_rng(4).normal(20, 5, 100)
     first = [trial("a", base, 0), trial("a", base, 1)]
-    assert seeds_agree(first, [trial("b", base + 1, 0), trial("b", base + 3, 1)], "rmse_px")
-    assert not seeds_agree(first, [trial("b", base + 1, 0), trial("b", base - 0.1, 1)], "rmse_px")
+    second = [trial("b", base + 1, 0), trial("b", np.where(base > 20, np.nan, base - 0.1), 1)]
+    gaps = seed_gaps(first, second, "rmse_px")
+    assert gaps == pytest.approx([-1, base.mean() - base[base <= 20].mean() + 0.1])
+    assert np.isnan(seed_gaps(first[:1], [trial("b", np.full(100, np.nan))], "rmse_px")).all()
 
 
 def test_a_resample_without_a_known_value_is_left_out() -> None:

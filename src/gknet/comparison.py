@@ -142,8 +142,7 @@ def difference(
 
     With as many seeds on both sides they are drawn as pairs.
     """
-    if first[0].frames != second[0].frames:
-        raise GknetError(f"comparison: {first[0].method} and {second[0].method} were judged on different frames")
+    _check_frames(first[0], second[0])
     tables = [_by_sequence(trials, metric) for trials in (first, second)]
     draws = _draws(len(first), tables[0][1].shape[1], seed, resamples)
     seeds = draws[1] if len(second) == len(first) else _draws(len(second), 1, seed + 1, resamples)[1]
@@ -152,13 +151,14 @@ def difference(
     return Interval(float(means[0] - means[1]), *_ends(gap))
 
 
-def seeds_agree(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> bool:
-    """Whether each seed by itself puts the same method ahead."""
-    ahead = {
-        np.sign(np.nanmean(one.values[metric]) - np.nanmean(other.values[metric]))
-        for one, other in zip(first, second, strict=True)
-    }
-    return len(ahead) == 1
+def seed_gaps(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> list[float]:
+    """The difference of the means of each seed by itself, in the metric's unit; NaN of one that knows nothing."""
+
+    def mean(trial: Trial) -> float:
+        known = trial.values[metric][~np.isnan(trial.values[metric])]
+        return float(known.mean()) if len(known) else float("nan")
+
+    return [mean(one) - mean(other) for one, other in zip(first, second, strict=True)]
 
 
 def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
@@ -169,11 +169,15 @@ def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tup
 
     pairs = []
     for one, other in zip(first, second, strict=True):
-        if one.frames != other.frames:
-            raise GknetError(f"comparison: {one.method} and {other.method} were judged on different frames")
+        _check_frames(one, other)
         known = np.maximum(one.values["e_q_rad"], other.values["e_q_rad"]) <= ATTITUDE_HOLDS_RAD
         pairs.append((masked(one, known), masked(other, known)))
     return [one for one, _ in pairs], [other for _, other in pairs]
+
+
+def _check_frames(one: Trial, other: Trial) -> None:
+    if one.frames != other.frames:
+        raise GknetError(f"comparison: {one.method} and {other.method} were judged on different frames")
 
 
 def _by_sequence(
@@ -182,8 +186,8 @@ def _by_sequence(
     """Sums and numbers of the known values of each sequence."""
     if not trials:
         raise GknetError("comparison: expected at least one trial, got none")
-    if any(trial.frames != trials[0].frames for trial in trials):
-        raise GknetError(f"comparison: the trials of {trials[0].method} were judged on different frames")
+    for trial in trials:
+        _check_frames(trials[0], trial)
     if any(metric not in trial.values for trial in trials):
         raise GknetError(f"comparison: the trials of {trials[0].method} know no metric {metric}; judge them again")
     names = sorted(set(trials[0].sequences))

@@ -9,7 +9,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from gknet.comparison import Interval, Trial
 
 pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
@@ -40,32 +43,26 @@ def test_a_result_that_is_none(content: str, tmp_path: Path) -> None:
     assert not (tmp_path / "cpu" / "README.md").exists()
 
 
-def test_a_result_without_its_curve(tmp_path: Path) -> None:
-    """As results were before they told how the training went."""
+@pytest.mark.parametrize("path", [("curve",), ("protocols", "oracle", "values", "e_q_rad"), ("protocols", "oracle")])
+def test_a_result_that_lacks_something(path: tuple[str, ...], tmp_path: Path) -> None:
+    """As results of an earlier recipe do, of its curve or of a metric."""
     kept = next((RECIPES.parent / "results" / "paper_tables" / "cpu").glob("satellite_*.json"))
     content = json.loads(kept.read_text(encoding="utf-8"))
-    del content["curve"]
+    *parents, last = path
+    inner = content
+    for name in parents:
+        inner = inner[name]
+    del inner[last]
     (tmp_path / "cpu").mkdir()
     (tmp_path / "cpu" / kept.name).write_text(json.dumps(content))
     said = refused("paper_report.py", "--results", tmp_path)
     assert f"{kept.name}: not a result" in said
-    assert "no curve" in said
+    assert f"no {last}" in said
     assert said.count("\n") == 1
 
 
-def test_a_result_without_a_metric(tmp_path: Path) -> None:
-    kept = next((RECIPES.parent / "results" / "paper_tables" / "cpu").glob("satellite_*.json"))
-    content = json.loads(kept.read_text(encoding="utf-8"))
-    del content["protocols"]["oracle"]["values"]["e_q_rad"]
-    (tmp_path / "cpu").mkdir()
-    (tmp_path / "cpu" / kept.name).write_text(json.dumps(content))
-    said = refused("paper_report.py", "--results", tmp_path)
-    assert f"{kept.name}: not a result" in said
-    assert "no e_q_rad" in said
-    assert said.count("\n") == 1
-
-
-def test_a_score_that_is_none(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", ["{}", '{"score": NaN}'])
+def test_a_score_that_is_none(content: str, tmp_path: Path) -> None:
     work, sweep = tmp_path / "work" / "cpu", tmp_path / "results" / "cpu" / "sweep"
     work.mkdir(parents=True)
     sweep.mkdir(parents=True)
@@ -73,7 +70,7 @@ def test_a_score_that_is_none(tmp_path: Path) -> None:
     scale = runpy.run_path(str(RECIPES / "paper_tables.py"))["SCALES"]["cpu"]
     names = [f"satellite_02_{method.network}_{rate:g}.json" for method in scale.methods for rate in scale.rates]
     for name in names:
-        (sweep / name).write_text("{}")
+        (sweep / name).write_text(content)
     folders = ("--work", tmp_path / "work", "--results", tmp_path / "results")
     said = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
     assert f"{names[0]}: not a score" in said
@@ -123,6 +120,28 @@ def test_the_papers_training_has_the_papers_loss(monkeypatch: pytest.MonkeyPatch
     assert (settings.auxiliary, settings.weight_decay, settings.ema, settings.optimizer) == (0, 0, 0, "adamw")
     for method in paper_tables.SCALES["full"].methods[:3]:
         assert replace(settings, network=method.network).chosen_loss == "squared"
+
+
+@pytest.mark.parametrize(("second", "bold"), [(5.0, True), (-0.1, False)])
+def test_a_difference_is_bold_where_each_seed_agrees(
+    second: float, bold: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(RECIPES))
+    import paper_report
+
+    def trials(shifts: tuple[float, float]) -> list[Trial]:
+        names = tuple(str(k) for k in range(30))
+        return [
+            Trial("m", "satellite_01", seed, names, names, {"e_t": np.full(30, 9.0 + shift)}, np.eye(2, dtype=np.int64))
+            for seed, shift in enumerate(shifts)
+        ]
+
+    both = {("a", "satellite_01", "oracle"): trials((5, second)), ("b", "satellite_01", "oracle"): trials((0, 0))}
+    monkeypatch.setattr(paper_report, "difference", lambda *_: Interval(2, 1, 3))  # it excludes zero
+    row = paper_report.difference_row(both, "a", "b", "e_t", "oracle")
+    assert row[0].startswith("**") == bold
+    assert f"2 seeds: 5, {second:.2g}" in row[0]
+    assert row[1:] == ["not run", "not run"]
 
 
 @pytest.mark.parametrize("share", ["2/2", "-1/2", "1", "a/b", "0/0"])
