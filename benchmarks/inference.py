@@ -23,15 +23,15 @@ from numpy import ndarray
 from rich.console import Console
 from rich.table import Table
 
-from gknet.crop import Crop
-from gknet.decode import decode_heatmaps
-from gknet.direct import DirectEstimator, decode_output
 from gknet.errors import ends_in_one_line
-from gknet.estimator import Estimator, load_estimator
 from gknet.frame import Box, Keypoints
 from gknet.geometry import Camera, Pose
-from gknet.locate import network_input
-from gknet.pnp import solve_pnp
+from gknet.inference.crop import Crop
+from gknet.inference.decode import decode_heatmaps
+from gknet.inference.direct_estimator import DirectEstimator, decode_output
+from gknet.inference.estimator import Estimator, load_estimator
+from gknet.inference.locate import network_input
+from gknet.inference.pnp import solve_pnp
 
 CAMERA = Camera.from_focal(1400, 1024, 1024)
 
@@ -50,7 +50,7 @@ def median_ms(call: Callable[[], object], runs: int) -> float:
 def stages(estimator: Estimator | DirectEstimator, runs: int) -> dict[str, float]:
     """Median milliseconds of each stage, and of the whole way from a 1024 x 1024 frame to a pose."""
     image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
-    crop = Crop(200, 200, 600, estimator.looking.input_size)
+    crop = Crop(200, 200, 600, estimator.settings.input_size)
     given = network_input(image, crop)
     look = direct_stages if isinstance(estimator, DirectEstimator) else keypoint_stages
     found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs), **look(estimator, given, crop, runs)}
@@ -75,7 +75,7 @@ def keypoint_stages(
     count = craft.keypoint_count
     keypoints = Keypoints(pixels, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
     box = Box.around(true_px) if trust_box else None
-    views = np.repeat(given, estimator.looking.turns, axis=0)
+    views = np.repeat(given, estimator.settings.tta_rotations, axis=0)
     heatmaps = estimator.keypoint_network(given).heatmaps[0]
     stride = crop.size / heatmaps.shape[2]
     return {
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx or direct.onnx")
     parser.add_argument("--paper", action="store_true", help="time gknet-paper too, the unit of the ratios")
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--turns", type=int, default=1, help="orientations in which a crop is seen: 1, 2 or 4")
+    parser.add_argument("--tta-rotations", type=int, default=1, help="orientations in which a crop is seen: 1, 2 or 4")
     chosen = parser.parse_args()
 
     table = Table("stage", "threads", "ms", "of gknet-paper", title=f"inference, {chosen.model}")
@@ -133,7 +133,9 @@ def main() -> None:
             paper_times = {threads: paper_ms(path, threads, chosen.runs) for threads in (1, 2)}
     for threads in (1, 2):
         paper = paper_times.get(threads)
-        for stage, ms in stages(load_estimator(chosen.model, threads, turns=chosen.turns), chosen.runs).items():
+        for stage, ms in stages(
+            load_estimator(chosen.model, threads, tta_rotations=chosen.tta_rotations), chosen.runs
+        ).items():
             table.add_row(stage, str(threads), f"{ms:.2f}", f"1/{paper / ms:.0f}" if paper else "-")
         if paper:
             table.add_row("gknet-paper's network", str(threads), f"{paper:.0f}", "1")

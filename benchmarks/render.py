@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from gknet.crop import Crop
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.render import film
 from gknet.render.materials import build_shapes, read_glb
 from gknet.render.scenario import Sensor, Shot

@@ -113,7 +113,7 @@ def test_estimate_is_a_pose_or_a_reason() -> None:
 def test_a_pose_is_doubted_when_more_is_believed_of_other_attitudes() -> None:
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 5.0]))
     doubted = [
-        Estimate(cam_from_body=pose, attitude_belief=belief).is_doubted for belief in (None, 0.0, 0.49, 0.5, 1.0)
+        Estimate(cam_from_body=pose, attitude_confidence=belief).is_ambiguous for belief in (None, 0.0, 0.49, 0.5, 1.0)
     ]
     assert doubted == [False, True, True, False, False]
-    assert not Estimate(failure="dark").is_doubted
+    assert not Estimate(failure="dark").is_ambiguous

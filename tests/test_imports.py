@@ -16,17 +16,14 @@ SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 
 LAYERS = (
     {"errors"},
-    {"atomic", "geometry", "progress", "torch_file"},
-    {"frame", "image", "video"},
-    {"crop", "spacecraft"},
-    {"attitude", "decode", "pnp"},
-    {"fleet", "dataset", "locate", "network", "pose_file"},
-    {"camera_file", "direct", "metrics", "onnx_network"},
-    {"estimator"},
-    {"calibration", "paper_protocol", "source"},
+    {"geometry"},
+    {"frame", "spacecraft"},
+    {"io"},
+    {"dataset", "fleet", "inference"},
+    {"network"},
     {"evaluation"},
-    {"comparison", "report"},
-    {"prediction", "render", "training"},
+    {"report"},
+    {"predict", "render", "training"},
     {"cli"},
 )
 """A room imports from the lines above its own, never from its neighbours nor from below."""
@@ -37,7 +34,8 @@ HEAVY = {
     *("mitsuba", "drjit", "trimesh", "manifold3d", "shapely", "mapbox_earcut", "PIL", "mpl_toolkits", "matplotlib"),
 }
 MAY_BE_HEAVY = {"fleet", "render", "network", "training"}
-NETWORK_MAY_KNOW = {"attitude", "errors"}
+NETWORK_MAY_KNOW = {"errors", "inference"}
+NETWORK_MAY_KNOW_OF_INFERENCE = {"gknet.inference.attitude"}
 FACE = "__init__"
 
 
@@ -98,6 +96,8 @@ def test_imports_run_downward(path: Path) -> None:
 @pytest.mark.parametrize("path", [p for p in files() if room_of(p) == "network"], ids=lambda path: path.name)
 def test_networks_know_no_frames(path: Path) -> None:
     assert rooms_imported(path) <= NETWORK_MAY_KNOW | {"network"}
+    of_inference = {name for name in imported(path, on_loading=False) if name.startswith("gknet.inference")}
+    assert of_inference <= NETWORK_MAY_KNOW_OF_INFERENCE
 
 
 @pytest.mark.parametrize("path", [p for p in files() if room_of(p) not in MAY_BE_HEAVY], ids=lambda p: p.name)
@@ -121,7 +121,7 @@ def test_the_package_alone_loads_no_library() -> None:
     "code",
     [
         "import gknet\nfor name in gknet.__all__: getattr(gknet, name)",
-        "import gknet.evaluation, gknet.fleet, gknet.prediction, gknet.report.page",
+        "import gknet.evaluation.evaluate, gknet.fleet, gknet.predict.results, gknet.report.page",
         "import gknet.cli.main as m\nsys.argv = ['gknet', '--help']\ntry:\n    m.main()\nexcept SystemExit: pass",
     ],
     ids=["every name", "the runtime", "gknet --help"],

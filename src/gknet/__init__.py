@@ -12,11 +12,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gknet.crop import Crop
     from gknet.errors import GknetError
-    from gknet.estimator import Estimator, load_estimator
     from gknet.frame import Box, Estimate, Frame, Keypoints
     from gknet.geometry import Camera, Pose
+    from gknet.inference.crop import Crop
+    from gknet.inference.estimator import Estimator, load_estimator
     from gknet.spacecraft import Spacecraft, load_spacecraft
 
 __version__ = "0.1.0"
@@ -39,15 +39,15 @@ __all__ = [
 _HOMES = {
     "Box": "frame",
     "Camera": "geometry",
-    "Crop": "crop",
+    "Crop": "inference.crop",
     "Estimate": "frame",
-    "Estimator": "estimator",
+    "Estimator": "inference.estimator",
     "Frame": "frame",
     "GknetError": "errors",
     "Keypoints": "frame",
     "Pose": "geometry",
     "Spacecraft": "spacecraft",
-    "load_estimator": "estimator",
+    "load_estimator": "inference.estimator",
     "load_spacecraft": "spacecraft",
 }
 

@@ -79,7 +79,7 @@ class Frame:
     image: UInt8[ndarray, "h w 3"] | None
     camera: Camera
     cam_from_body: Pose | None = None
-    visible: Bool[ndarray, "n"] | None = None
+    visible: Bool[ndarray, " n"] | None = None
     sun_direction: Float[ndarray, "3"] | None = None
     time_s: float | None = None
     earth_in_view: bool | None = None
@@ -120,11 +120,11 @@ class Keypoints:
     """
 
     pixels: Float[ndarray, "n 2"]
-    score: Float[ndarray, "n"]
+    score: Float[ndarray, " n"]
     covariance_px2: Float[ndarray, "n 2 2"]
 
 
-DOUBTED_BELIEF = 0.5
+AMBIGUOUS_BELOW = 0.5
 """A belief in the attitude below this is a doubt that is put in words."""
 
 
@@ -137,25 +137,33 @@ class Estimate:
                       R_true = exp([dw]x) R, t_true = t + dt
     inliers           (n,) bool: keypoints that the pose agrees with
     box               where the spacecraft was looked for, in pixels of the image
-    attitude_belief   0 to 1: the network's belief in attitudes within 60 degrees of the pose's. The rest of it is in
-                      others: below a half the pose may well be that of a twin, whatever the covariance says. None of a
-                      network that has no such belief
+    attitude_confidence   0 to 1: the probability that the network gives to attitudes within 60 degrees of the pose's.
+                      Below a half the pose may be that of a symmetric counterpart, whatever the covariance says. None
+                      when the network estimates no attitude distribution
     """
 
     keypoints: Keypoints | None = None
     cam_from_body: Pose | None = None
     covariance: Float[ndarray, "6 6"] | None = None
-    inliers: Bool[ndarray, "n"] | None = None
+    inliers: Bool[ndarray, " n"] | None = None
     reprojection_rms_px: float | None = None
     box: Box | None = None
     failure: str | None = None
-    attitude_belief: float | None = None
+    attitude_confidence: float | None = None
 
     def __post_init__(self) -> None:
         if (self.cam_from_body is None) != (self.failure is not None):
             raise GknetError("estimate: expected either a pose or the reason why there is none")
 
     @property
-    def is_doubted(self) -> bool:
+    def is_ambiguous(self) -> bool:
         """Whether the network that saw the keypoints believes more in other attitudes than in the pose's."""
-        return self.attitude_belief is not None and self.attitude_belief < DOUBTED_BELIEF
+        return self.attitude_confidence is not None and self.attitude_confidence < AMBIGUOUS_BELOW
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """A picture that is listed but cannot be had, and why."""
+
+    name: str
+    reason: str

@@ -12,7 +12,7 @@ from gknet.cli import doctor
 from gknet.cli.doctor import Finding, State
 from gknet.cli.main import run
 from gknet.errors import GknetError
-from gknet.locate import Looking, Seen
+from gknet.inference.locate import InferenceSettings, NetworkOutput
 from gknet.spacecraft import Spacecraft
 from tests.cli.toy import toy_spacecraft
 
@@ -23,18 +23,18 @@ class ToyModel:
 
     channels: int = 13
     spacecraft: Spacecraft = field(default_factory=toy_spacecraft)
-    looking: Looking = field(default_factory=Looking)
+    settings: InferenceSettings = field(default_factory=InferenceSettings)
     locator: object = None
 
-    def keypoint_network(self, images: np.ndarray) -> Seen:
-        return Seen(np.full((len(images), self.channels, 64, 64), images.mean(), dtype=np.float32))
+    def keypoint_network(self, images: np.ndarray) -> NetworkOutput:
+        return NetworkOutput(np.full((len(images), self.channels, 64, 64), images.mean(), dtype=np.float32))
 
 
 @pytest.fixture
 def model(monkeypatch: pytest.MonkeyPatch) -> Callable[[ToyModel], None]:
     def put(toy: ToyModel) -> None:
-        monkeypatch.setattr("gknet.estimator.shipped_models", lambda: ("toycraft",))
-        monkeypatch.setattr("gknet.estimator.load_estimator", lambda name: toy)
+        monkeypatch.setattr("gknet.inference.estimator.shipped_models", lambda: ("toycraft",))
+        monkeypatch.setattr("gknet.inference.estimator.load_estimator", lambda name: toy)
 
     return put
 

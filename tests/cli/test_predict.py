@@ -16,8 +16,8 @@ from gknet.cli.main import run
 from gknet.cli.predict import choose_estimator
 from gknet.dataset.skd import SkdDataset
 from gknet.frame import Box
-from gknet.image import read_image, write_image
-from gknet.video import VideoWriter, open_video
+from gknet.io.image import read_image, write_image
+from gknet.io.video import VideoWriter, open_video
 from tests.cli.toy import FOCAL_PX, SIZE, Noting, ToyEstimator, toy_picture, toy_pose
 
 Use = Callable[[ToyEstimator], None]
@@ -94,7 +94,7 @@ def test_folder_goes_on_past_bad_pictures(
     assert "2 of 5 pictures have a pose, 3 failed" in words
     assert "truncated" in words
     assert "1 of the poses may be a twin's" in words
-    assert [record.get("attitude_belief") for record in records(out)] == [0.9, None, 0.2, None, None]
+    assert [record.get("attitude_confidence") for record in records(out)] == [0.9, None, 0.2, None, None]
     assert (out / "overlays" / "deep_c.jpg").exists()
 
 
@@ -272,9 +272,9 @@ def test_video_without_frames(use: Use, refused: Refused, tmp_path: Path) -> Non
 
 
 def test_turns_reach_the_estimator(refused: Refused, pictures: Path, tmp_path: Path) -> None:
-    assert choose_estimator("satellite_01", None, 1, 4).looking.turns == 4
+    assert choose_estimator("satellite_01", None, 1, 4).settings.tta_rotations == 4
     shipped = ("--spacecraft", "satellite_01", *LENS)
-    line = refused("predict", pictures / "a.jpg", *shipped, "--turns", "3", "--out", tmp_path / "out")
+    line = refused("predict", pictures / "a.jpg", *shipped, "--tta-rotations", "3", "--out", tmp_path / "out")
     assert "1, 2 or 4" in line
     assert "got 3" in line
 
@@ -342,7 +342,7 @@ def test_full_disk_leaves_nothing_half_written(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gknet.prediction.write_image", full)
+    monkeypatch.setattr("gknet.predict.results.write_image", full)
     out = tmp_path / "out"
     assert "No space left" in refused("predict", pictures, *MODEL, *LENS, "--video", "--out", out)
     assert leftovers(out) == []

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-from gknet.atomic import write_text
 from gknet.dataset.skd_format import Annotation, row_of
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
 from gknet.frame import Box, Estimate, Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.io.atomic import write_text
 from gknet.spacecraft import Spacecraft, spacecraft_toml
 
 SIZE, FOCAL_PX = 256, 350.0
@@ -118,7 +118,7 @@ class ToyEstimator:
         )
         covariance = np.diag([4e-4, 4e-4, 4e-4, 2.5e-3, 2.5e-3, 2.5e-3])
         inliers, belief = np.ones(count, dtype=bool), 0.2 if number in self.doubted else 0.9
-        return Estimate(keypoints, moved, covariance, inliers, self.error, box or found, attitude_belief=belief)
+        return Estimate(keypoints, moved, covariance, inliers, self.error, box or found, attitude_confidence=belief)
 
 
 @dataclass(frozen=True, eq=False)

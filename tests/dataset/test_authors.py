@@ -23,8 +23,8 @@ from gknet.dataset.skd_write import (
 from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera, Pose
+from gknet.io.torch_file import load_torch_file
 from gknet.spacecraft import Spacecraft
-from gknet.torch_file import load_torch_file
 from tests.dataset import authors
 
 SIZE = 96

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.dataset.skd_format import SPLITS, Annotation, row_of, sequence_name
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.spacecraft import Spacecraft, save_spacecraft
 
 POINTS = np.array([[1.2, 0.1, -0.3], [-1.1, 0.7, 0.2], [0.3, -1.4, 0.9], [0.5, 0.4, 1.7], [-0.6, -0.8, -1.3]])

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from gknet.dataset.skd import SkdDataset
 from gknet.dataset.skd_format import SPLITS, category_of
-from gknet.metrics import oracle_crop
+from gknet.evaluation.metrics import oracle_crop
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("torch")

@@ -21,7 +21,7 @@ METHODS = ("gknet-xs", "hrnet-xs", "resunet-xs", "dmanet-xs", "gknet-xs_identity
 
 
 def recipe(name: str, *words: object) -> str:
-    command = [sys.executable, str(ROOT / "recipes" / name), *map(str, words)]
+    command = [sys.executable, str(ROOT / "experiments" / name), *map(str, words)]
     run = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     assert run.returncode == 0, f"{run.stdout[-2000:]}\n{run.stderr[-3000:]}"
     return run.stdout

@@ -10,11 +10,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import POSITION_WIDTH, code_of, position_code  # noqa: E402
+from gknet.network.backbone import POSITION_WIDTH, fourier_encoding, position_encoding  # noqa: E402
 from gknet.network.build import gknet_s, gknet_xs  # noqa: E402
 from gknet.network.gknet import GKNet  # noqa: E402
 from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
-from gknet.network.heatmap import SHARPNESS, Hints  # noqa: E402
+from gknet.network.heatmap import SHARPNESS, KeypointPrompts  # noqa: E402
 from tests.network.tiny import chain, points, tiny  # noqa: E402
 
 
@@ -119,15 +119,17 @@ def test_votes_are_of_what_nodes_are_convinced_of_and_come_before_the_second_loo
     network.attitude.classes.bias.data[7] = 0
     truth = torch.zeros(1, 5, 16, 16)
     truth[0, 1, 3, 9] = 1
-    network.branches(torch.rand(1, 3, 64, 64), Hints(truth, torch.tensor([[False, True, False, False, False]])))
+    network.branches(
+        torch.rand(1, 3, 64, 64), KeypointPrompts(truth, torch.tensor([[False, True, False, False, False]]))
+    )
     assert said[:2] == [None, None]
     assert said[2] is said[3]
     place = torch.tensor([9.5, 3.5]) / 16 + network.prior.keypoints[7, 2] - network.prior.keypoints[7, 1]
     assert said[2] is not None
-    torch.testing.assert_close(said[2][0, 2, 1], code_of(place), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(said[2][0, 2, 1], fourier_encoding(place), atol=1e-4, rtol=1e-4)
 
 
-def glances_at(pixels: torch.Tensor, hints: Hints | None = None) -> list[torch.Tensor]:
+def glances_at(pixels: torch.Tensor, prompts: KeypointPrompts | None = None) -> list[torch.Tensor]:
     """Codes of the places (n, 34) that nodes see where the other branch has the maps `pixels`, at each glance."""
     network = tiny(pixels.shape[1], bins=0).eval()
     assert network.decoder is not None
@@ -138,13 +140,13 @@ def glances_at(pixels: torch.Tensor, hints: Hints | None = None) -> list[torch.T
     glances: list[torch.Tensor] = []
     for layer in network.decoder.layers:
         layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0][0, :, 8:]))
-    network.branches(torch.rand(1, 3, 64, 64), hints)
+    network.branches(torch.rand(1, 3, 64, 64), prompts)
     assert len(glances) == 4  # two layers, two looks
     return glances
 
 
 def code(rows: Sequence[int], columns: Sequence[int]) -> torch.Tensor:
-    return position_code(16, 16, torch.zeros(1))[:, rows, columns].T
+    return position_encoding(16, 16, torch.zeros(1))[:, rows, columns].T
 
 
 def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> None:
@@ -172,7 +174,7 @@ def test_a_node_that_is_told_sees_the_truth_in_its_second_look_alone() -> None:
     pixels, truth = torch.zeros(1, 3, 16, 16), torch.zeros(1, 3, 16, 16)
     pixels[0, :, 5, 5] = 10
     truth[0, :, 11, 7] = 0.25  # maps of any sum
-    glances = glances_at(pixels, Hints(truth, torch.tensor([[True, False, True]])))
+    glances = glances_at(pixels, KeypointPrompts(truth, torch.tensor([[True, False, True]])))
     for seen in glances[:2]:
         torch.testing.assert_close(seen, code([5, 5, 5], [5, 5, 5]), atol=1e-5, rtol=1e-4)
     for seen in glances[2:]:
@@ -186,9 +188,9 @@ def test_what_a_node_is_told_reaches_its_neighbours_in_the_second_look() -> None
         image, truth = torch.rand(1, 3, 64, 64), torch.zeros(1, 5, 16, 16)
         truth[0, 0, 2, 3] = 1
         told = torch.zeros(1, 5, dtype=torch.bool)
-        before = network.branches(image, Hints(truth, told))
+        before = network.branches(image, KeypointPrompts(truth, told))
         told[0, 0] = True
-        after = network.branches(image, Hints(truth, told))
+        after = network.branches(image, KeypointPrompts(truth, told))
         assert before.nodes is not None
         assert after.nodes is not None
         changed = (before.nodes - after.nodes).abs().amax(dim=(0, 2, 3)) > 1e-5
@@ -197,9 +199,9 @@ def test_what_a_node_is_told_reaches_its_neighbours_in_the_second_look() -> None
 
 
 def test_a_network_that_looks_once_takes_no_hints() -> None:
-    assert tiny(4).looks_twice
+    assert tiny(4).two_pass
     network = tiny(4, "none")
-    assert not network.looks_twice
+    assert not network.two_pass
     assert network.branches(torch.rand(1, 3, 64, 64)).first is None
 
 

@@ -10,9 +10,9 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 
-from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import position_code  # noqa: E402
+from gknet.inference.attitude import AttitudeBins  # noqa: E402
+from gknet.network.backbone import position_encoding  # noqa: E402
 from gknet.network.build import (  # noqa: E402
     GRAPH_NETWORKS,
     build,
@@ -30,7 +30,7 @@ from gknet.network.build import (  # noqa: E402
 from gknet.network.dmanet import DMANet, DMANetConfig, MultiScaleAttention  # noqa: E402
 from gknet.network.gknet import GKNetConfig  # noqa: E402
 from gknet.network.graph import normalised_adjacency  # noqa: E402
-from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_belief  # noqa: E402
+from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_probability  # noqa: E402
 from gknet.network.hrnet import HRNet, HRNetConfig  # noqa: E402
 from gknet.network.resunet import ResUNet, ResUNetConfig  # noqa: E402
 from gknet.training.loss import gaussian_targets  # noqa: E402
@@ -59,7 +59,7 @@ def test_the_forward_pass_is_the_belief_of_the_fused_branches(graph: str) -> Non
 
 def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
     maps = torch.randn(2, 3, 16, 16)
-    torch.testing.assert_close(log_belief(maps).exp().sum(dim=2), torch.ones(2, 3))
+    torch.testing.assert_close(log_probability(maps).exp().sum(dim=2), torch.ones(2, 3))
     target = gaussian_targets(torch.tensor([[[33.0, 30.5]]]), 4, 16, 16, SIGMA_CELLS)
     torch.testing.assert_close(expected_heatmaps(target.log() / SHARPNESS), target, atol=1e-4, rtol=0)
     twins = (target + target.flip(3)) / 2  # two places, equally likely: two peaks of half the height
@@ -195,7 +195,7 @@ def test_named_sizes() -> None:
 
 
 def test_the_code_of_a_place_is_the_same_at_every_resolution() -> None:
-    fine, coarse = position_code(30, 30, torch.zeros(1)), position_code(10, 10, torch.zeros(1))
+    fine, coarse = position_encoding(30, 30, torch.zeros(1)), position_encoding(10, 10, torch.zeros(1))
     torch.testing.assert_close(fine[:, 1::3, 1::3], coarse, atol=1e-5, rtol=0)
 
 

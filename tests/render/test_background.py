@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gknet.crop import Crop
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.render.scenario import CAMERA, EARTH_RADIUS_M, EarthView, Shot
 from gknet.render.sensor import Sensor
 

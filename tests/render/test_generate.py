@@ -13,12 +13,12 @@ import pytest
 pytest.importorskip("mitsuba")
 
 from gknet import fleet
-from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.frame import Box
 from gknet.geometry import Pose
-from gknet.image import read_image, read_mask
+from gknet.inference.crop import Crop
+from gknet.io.image import read_image, read_mask
 from gknet.render import generate as stage
 from gknet.render import worker
 from gknet.render.plan import FILM_SIZES, Options, Selection, parse_shard, plan_sequences, target_window
@@ -163,11 +163,11 @@ def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     drawn = []
     paint = worker.render_frame
 
-    def killed(studio: worker.Studio, name: str, sequence: int, index: int) -> dict[str, str]:
+    def killed(state: worker.WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
         if len(drawn) == 9:
             raise KeyboardInterrupt
         drawn.append((sequence, index))
-        return paint(studio, name, sequence, index)
+        return paint(state, name, sequence, index)
 
     monkeypatch.setattr(worker, "render_frame", killed)
     with pytest.raises(KeyboardInterrupt):
@@ -186,10 +186,10 @@ def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_bad_frame_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paint = worker.render_frame
 
-    def clumsy(studio: worker.Studio, name: str, sequence: int, index: int) -> dict[str, str]:
+    def clumsy(state: worker.WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
         if index == 3:
             raise GknetError("no light")
-        return paint(studio, name, sequence, index)
+        return paint(state, name, sequence, index)
 
     monkeypatch.setattr(worker, "render_frame", clumsy)
     result = run(tmp_path, sequences=1, spacecraft="satellite_03")

@@ -12,7 +12,7 @@ from gknet.errors import GknetError
 from gknet.geometry import Pose
 from gknet.render.recipe import RECIPES, Recipe, load_recipe
 from gknet.render.scenario import CAMERA, EARTH_RADIUS_M, Shot, shoot
-from gknet.render.sequence import Solved, solve
+from gknet.render.sequence import SequenceMotion, sample_sequence
 from gknet.spacecraft import Spacecraft
 
 SKD, HARD = RECIPES["skd"], RECIPES["skd-hard"]
@@ -29,11 +29,11 @@ def winged(name: str) -> Spacecraft:
 FLEET = {name: winged(name) for name in SKD.spacecraft}
 
 
-def solved(recipe: Recipe, sequence: int) -> Solved:
-    return solve(recipe, FLEET[recipe.spacecraft_of(sequence)], 0, sequence)
+def solved(recipe: Recipe, sequence: int) -> SequenceMotion:
+    return sample_sequence(recipe, FLEET[recipe.spacecraft_of(sequence)], 0, sequence)
 
 
-def pixels(motion: Solved, points_m: np.ndarray) -> np.ndarray:
+def pixels(motion: SequenceMotion, points_m: np.ndarray) -> np.ndarray:
     """(t, n, 2): the keypoints of all frames."""
     points = points_m @ motion.cam_from_body.transpose(0, 2, 1) + motion.body_cam_m[:, None]
     assert points[..., 2].min() > 0
@@ -48,7 +48,7 @@ def test_pixels_are_those_of_the_shot():
 
 
 @pytest.fixture(scope="module")
-def skd() -> list[Solved]:
+def skd() -> list[SequenceMotion]:
     return [solved(SKD, sequence) for sequence in range(45)]
 
 
@@ -60,7 +60,7 @@ def test_split_is_three_to_one_to_one_for_each_spacecraft():
     assert counts == {(name, s): k for name in SKD.spacecraft for s, k in (("train", 60), ("val", 20), ("test", 20))}
 
 
-def test_skd_limits_hold_on_every_frame(skd: list[Solved]):
+def test_skd_limits_hold_on_every_frame(skd: list[SequenceMotion]):
     points = FLEET["satellite_01"].points_m
     spans = []
     for motion in skd:
@@ -76,7 +76,7 @@ def test_skd_limits_hold_on_every_frame(skd: list[Solved]):
     assert np.max(spans) > 0.7
 
 
-def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[Solved]):
+def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[SequenceMotion]):
     phase = np.degrees([motion.phase_rad.mean() for motion in skd])
     assert (np.histogram(phase, bins=4, range=(0, 130))[0] >= 5).all()
     earth = np.array([motion.earth_in_view.mean() for motion in skd])
@@ -88,7 +88,7 @@ def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[Solved]):
     assert octants.min() > 0.06
 
 
-def test_neighbouring_frames_differ_a_little(skd: list[Solved]):
+def test_neighbouring_frames_differ_a_little(skd: list[SequenceMotion]):
     for motion in skd:
         step = np.einsum("tij,tij->t", motion.cam_from_body[1:], motion.cam_from_body[:-1])
         turn_deg = np.degrees(np.arccos(np.clip((step - 1) / 2, -1, 1)))
@@ -100,8 +100,8 @@ def test_neighbouring_frames_differ_a_little(skd: list[Solved]):
         assert moved.max() < 0.1
 
 
-def test_an_approach_moves_through_much_of_the_range(skd: list[Solved]):
-    ratios = [np.ptp(np.log(np.linalg.norm(m.body_cam_m, axis=1))) for m in skd if m.wish.kind == "approach"]
+def test_an_approach_moves_through_much_of_the_range(skd: list[SequenceMotion]):
+    ratios = [np.ptp(np.log(np.linalg.norm(m.body_cam_m, axis=1))) for m in skd if m.spec.kind == "approach"]
     assert len(ratios) >= 10
     assert np.exp(np.median(ratios)) > 2.5
 
@@ -118,7 +118,7 @@ def test_hard_recipe_goes_where_skd_does_not():
     assert 0.1 < (inside < len(points)).mean() < 0.7, "a good part of the frames is truncated"
     phase = np.degrees([motion.phase_rad for motion in motions])
     assert 150 < phase.max() <= 165
-    assert sum(motion.wish.scene == "earth_fills" for motion in motions) >= 5
+    assert sum(motion.spec.scene == "earth_fills" for motion in motions) >= 5
 
 
 @pytest.mark.parametrize("sequence", [0, 7, 31])
@@ -155,7 +155,7 @@ def comparable(shot: Shot) -> list[object]:
 def test_random_access_equals_sequential():
     craft = FLEET["satellite_02"]
     forward = [comparable(shoot(SKD, craft, 0, 4, index)) for index in (0, 50, 299)]
-    solve.cache_clear()
+    sample_sequence.cache_clear()
     shoot(SKD, FLEET["satellite_01"], 0, 3, 10)
     backward = [comparable(shoot(SKD, craft, 0, 4, index)) for index in (299, 50, 0)]
     assert forward == backward[::-1]
@@ -193,7 +193,7 @@ def test_limits_that_nothing_obeys_are_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gknet.render.sequence._ATTEMPTS", 20)
     motion = SKD.motion.model_copy(update={"span": (0.5, 0.501)})
     with pytest.raises(GknetError, match="obeys its limits"):
-        solve(SKD.model_copy(update={"motion": motion, "name": "narrow"}), FLEET["satellite_01"], 0, 0)
+        sample_sequence(SKD.model_copy(update={"motion": motion, "name": "narrow"}), FLEET["satellite_01"], 0, 0)
 
 
 def test_recipe_file_round_trip_and_bad_ones(tmp_path: Path):

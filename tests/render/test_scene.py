@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from tests.render.glb import QUAD, QUAD_FACES, Glb, box
 
 pytest.importorskip("mitsuba")
@@ -22,7 +22,7 @@ from gknet.render import shading
 from gknet.render import variant as variants
 from gknet.render.scenario import EarthView
 from gknet.render.scene import Renderer, choose_variant
-from tests.render.studio import CAMERA, FULL, VARIANT, batched, quad, shot, spacecraft, white
+from tests.render.state import CAMERA, FULL, VARIANT, batched, quad, shot, spacecraft, white
 
 BOX_SIZE = (1.0, 1.4, 0.8)
 BOX_POINTS = np.array(

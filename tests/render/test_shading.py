@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.geometry import Pose
+from gknet.inference.crop import Crop
 from tests.render.glb import QUAD, QUAD_FACES, Glb
 
 pytest.importorskip("mitsuba")
@@ -18,7 +18,7 @@ pytest.importorskip("trimesh")
 from gknet.render.scenario import EARTH_RADIUS_M, EarthView
 from gknet.render.scene import light_of
 from gknet.render.shading import EARTH_ALBEDO, STARLIGHT, sky_radiance
-from tests.render.studio import FULL, quad, quad_renderer, shot, white
+from tests.render.state import FULL, quad, quad_renderer, shot, white
 
 
 def test_radiance_one_is_a_white_surface_in_full_sun(tmp_path: Path) -> None:

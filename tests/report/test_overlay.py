@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Estimate, Frame, Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.report.canvas import Canvas
 from gknet.report.overlay import confidence, describe, draw_overlay, zoomed
 from gknet.report.palette import SKY, score_colour
@@ -105,7 +105,7 @@ def test_words() -> None:
     assert describe(frame, Estimate(failure="dark")) == ["toy/1", "no pose: dark"]
     assert confidence(Estimate(failure="dark")) is None
     for belief, said in ((0.97, "belief in the attitude 0.97"), (0.31, "belief in the attitude 0.31, perhaps a twin")):
-        assert describe(frame, replace(estimate, attitude_belief=belief))[3] == said
+        assert describe(frame, replace(estimate, attitude_confidence=belief))[3] == said
 
 
 def test_score_colours_grow_lighter() -> None:

@@ -10,11 +10,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from gknet.crop import Crop  # noqa: E402
 from gknet.dataset.skd import SkdDataset  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.frame import Box, Frame  # noqa: E402
 from gknet.geometry import Camera, Pose  # noqa: E402
+from gknet.inference.crop import Crop  # noqa: E402
 from gknet.training.batch import Loader, Sample, draw_box, draw_keypoints  # noqa: E402
 from gknet.training.cache import Cache, build_cache, cached_row, craft_window  # noqa: E402
 from gknet.training.schedule import Stage  # noqa: E402

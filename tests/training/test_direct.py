@@ -14,15 +14,15 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
 import gknet.training.export as exporting  # noqa: E402
-from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.cli.main import run as command  # noqa: E402
-from gknet.crop import Crop  # noqa: E402
 from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.direct import CropPose, DirectEstimator, decode_output  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.estimator import load_estimator  # noqa: E402
 from gknet.frame import Frame  # noqa: E402
 from gknet.geometry import Camera, Pose  # noqa: E402
+from gknet.inference.attitude import AttitudeBins  # noqa: E402
+from gknet.inference.crop import Crop  # noqa: E402
+from gknet.inference.direct_estimator import CropPose, DirectEstimator, decode_output  # noqa: E402
+from gknet.inference.estimator import load_estimator  # noqa: E402
 from gknet.network.build import build  # noqa: E402
 from gknet.network.dmanet import Branches, DMANet, DMANetConfig  # noqa: E402
 from gknet.training.augment import Augmentation, craft_warp, rotation  # noqa: E402
@@ -227,7 +227,7 @@ def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     assert isinstance(estimator, DirectEstimator)
     assert estimator.locator is None
     assert estimator.bins == AttitudeBins(16)
-    assert estimator.looking.input_size == 64
+    assert estimator.settings.input_size == 64
     frames = SkdDataset(data, "val", "satellite_01")
     best = json.loads((finished / "run.json").read_text())["best"]
     found = validate_direct(exported(estimator), torch.device("cpu"), frames, [0, 1], CRAFT, estimator.bins, 64)
@@ -235,7 +235,7 @@ def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     frame = frames.frame(0)
     estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(POINTS))
     assert (estimate.cam_from_body is None) == (estimate.failure is not None)
-    assert (estimate.attitude_belief is None) == (estimate.cam_from_body is None)
+    assert (estimate.attitude_confidence is None) == (estimate.cam_from_body is None)
 
 
 def exported(estimator: DirectEstimator) -> torch.nn.Module:

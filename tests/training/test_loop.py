@@ -14,11 +14,11 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
 import gknet.training.export as exporting  # noqa: E402
-from gknet.attitude import AttitudeBins  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.estimator import load_estimator  # noqa: E402
+from gknet.inference.attitude import AttitudeBins  # noqa: E402
+from gknet.inference.estimator import load_estimator  # noqa: E402
+from gknet.inference.onnx_model import OnnxModel  # noqa: E402
 from gknet.network.build import build  # noqa: E402
-from gknet.onnx_network import OnnxNetwork  # noqa: E402
 from gknet.spacecraft import spacecraft_from_toml  # noqa: E402
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
 from gknet.training.export import export_run  # noqa: E402
@@ -134,7 +134,7 @@ def test_exports_agree_with_torch_and_know_what_they_are(
         result = export_run(run, tmp_path)
         assert result.onnx_path == tmp_path / f"{kind}.onnx"
         assert result.runtime_difference <= 1e-3
-        network = OnnxNetwork(result.onnx_path, threads=1)
+        network = OnnxModel(result.onnx_path, threads=1)
         assert network.metadata.kind == kind
         assert network.metadata.stride == 4
         assert network.spacecraft.name == "satellite_01"
@@ -157,9 +157,9 @@ def test_an_exported_belief_in_the_attitude_is_that_of_the_trained_weights(glanc
     trained = build(run.network, spacecraft.adjacency, spacecraft.points_m, run.graph, run.loss).eval()
     trained.load_state_dict(load_weights(glancing / BEST))
     images = np.random.default_rng(0).random((2, 3, 64, 64), dtype=np.float32)
-    seen = OnnxNetwork(export_run(glancing, tmp_path).onnx_path, threads=1).seen(images)
+    seen = OnnxModel(export_run(glancing, tmp_path).onnx_path, threads=1).predict(images)
     with torch.no_grad():
-        heatmaps, attitude = trained.seen(torch.from_numpy(images))
+        heatmaps, attitude = trained.predict(torch.from_numpy(images))
     np.testing.assert_allclose(seen.heatmaps, heatmaps, atol=0.01)
     np.testing.assert_allclose(seen.attitude, attitude, atol=1e-3)
     np.testing.assert_allclose(seen.attitude.sum(axis=1), 1, rtol=1e-4)

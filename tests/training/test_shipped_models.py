@@ -16,7 +16,7 @@ pytest.importorskip("mitsuba")
 
 from gknet.dataset.skd import SkdDataset  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.estimator import load_estimator  # noqa: E402
+from gknet.inference.estimator import load_estimator  # noqa: E402
 from gknet.network.build import build  # noqa: E402
 from gknet.render.recipe import RECIPES  # noqa: E402
 from gknet.training.checkpoint import BEST, load_weights, save_weights  # noqa: E402
@@ -25,12 +25,12 @@ from gknet.training.schedule import Stage  # noqa: E402
 CRAFT = "satellite_01"
 STAGES = (Stage(1.0, 64, 4),)
 SEED = 5
-RECIPES_FOLDER = Path(__file__).parents[2] / "recipes"
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
 @pytest.fixture
 def recipe(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(RECIPES_FOLDER))
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
     import shipped_models
 
     monkeypatch.setattr(shipped_models, "NAMES", (CRAFT,))

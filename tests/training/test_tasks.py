@@ -8,8 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from gknet.attitude import AttitudeBins  # noqa: E402
-from gknet.network.heatmap import SIGMA_CELLS, Branches, Hints  # noqa: E402
+from gknet.inference.attitude import AttitudeBins  # noqa: E402
+from gknet.network.heatmap import SIGMA_CELLS, Branches, KeypointPrompts  # noqa: E402
 from gknet.training.batch import Batch  # noqa: E402
 from gknet.training.loss import gaussian_targets, heatmap_loss  # noqa: E402
 from gknet.training.tasks import ATTITUDE, FIRST_LOOK, KeypointTask  # noqa: E402
@@ -34,11 +34,11 @@ class Answers(torch.nn.Module):
 
     def __init__(self, branches: Branches) -> None:
         super().__init__()
-        self.answer, self.looks_twice = branches, branches.first is not None
-        self.hints: list[Hints] = []
+        self.answer, self.two_pass = branches, branches.first is not None
+        self.prompts: list[KeypointPrompts] = []
 
-    def branches(self, image: torch.Tensor, *hints: Hints) -> Branches:
-        self.hints += hints
+    def branches(self, image: torch.Tensor, *prompts: KeypointPrompts) -> Branches:
+        self.prompts += prompts
         return self.answer
 
 
@@ -56,9 +56,9 @@ def wrong(picture: int, keypoint: int) -> torch.Tensor:
 def test_a_network_that_looks_twice_is_told_the_truth_of_the_told() -> None:
     network = Answers(Branches(TRUTH, TRUTH, TRUTH, TRUTH))
     assert KeypointTask(toy_spacecraft(), 64, 0.2).loss(network, BATCH, CPU) == 0
-    (hints,) = network.hints
-    assert torch.equal(hints.maps, TRUTH)
-    assert torch.equal(hints.told, BATCH.told)
+    (prompts,) = network.prompts
+    assert torch.equal(prompts.maps, TRUTH)
+    assert torch.equal(prompts.told, BATCH.told)
 
 
 def test_the_told_keypoints_count_in_the_first_look_alone() -> None:

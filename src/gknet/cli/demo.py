@@ -10,10 +10,10 @@ import typer
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
-    from gknet.evaluation import Evaluation
-    from gknet.locate import CropEstimator
+    from gknet.dataset.skd import SkdDataset
+    from gknet.evaluation.evaluate import Evaluation
+    from gknet.inference.locate import CropEstimator
     from gknet.report.page import Section
-    from gknet.source import SkdDataset
 
 _FPS = 6.0
 
@@ -27,9 +27,9 @@ def demo(
 
     from rich.console import Console
 
-    from gknet.estimator import load_estimator, shipped_models
+    from gknet.dataset.skd import open_dataset
+    from gknet.inference.estimator import load_estimator, shipped_models
     from gknet.report.table import comparison_table
-    from gknet.source import open_dataset
 
     start = time.perf_counter()
     names = shipped_models()
@@ -64,11 +64,11 @@ def bundled_frames() -> Path:
 def show(dataset: SkdDataset, estimator: CropEstimator, out: Path) -> tuple[Section, list[Path]]:
     """Evaluate one spacecraft, and write its poses, overlays and video of the last protocol."""
     from gknet.cli.evaluate import evaluate_section
-    from gknet.prediction import PredictionFiles
+    from gknet.predict.results import PredictionWriter
 
     section = evaluate_section(dataset, estimator, "bundled test frames", pictures=3)
     folder = out / estimator.spacecraft.name
-    with PredictionFiles(folder, estimator.spacecraft, fps=_FPS) as files:
+    with PredictionWriter(folder, estimator.spacecraft, fps=_FPS) as files:
         for case in section.evaluation.runs[-1].cases:
             files.add(dataset.frame(case.index), case.estimate)
     return section, [path for path in (files.poses_path, files.overlay_folder, files.video_path) if path is not None]

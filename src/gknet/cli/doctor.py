@@ -109,7 +109,7 @@ def _providers() -> Finding:
 
 def _models() -> Iterator[Finding]:
     """Load each shipped model and run it once: shape, finite, and the same answer twice."""
-    from gknet.estimator import shipped_models
+    from gknet.inference.estimator import shipped_models
 
     names = shipped_models()
     if not names:
@@ -127,20 +127,20 @@ def _try_model(name: str) -> str:
 
     import numpy as np
 
-    from gknet.direct import DirectEstimator
-    from gknet.estimator import load_estimator
+    from gknet.inference.direct_estimator import DirectEstimator
+    from gknet.inference.estimator import load_estimator
 
     estimator = load_estimator(name)
-    looking = estimator.looking
+    settings = estimator.settings
     if isinstance(estimator, DirectEstimator):
-        expected = {"direct": (estimator.network, looking.input_size, 3 + estimator.bins.count)}
+        expected = {"direct": (estimator.network, settings.input_size, 3 + estimator.bins.count)}
     else:
         see = estimator.keypoint_network
         expected = {
-            "keypoints": (lambda images: see(images).heatmaps, looking.input_size, estimator.spacecraft.keypoint_count)
+            "keypoints": (lambda images: see(images).heatmaps, settings.input_size, estimator.spacecraft.keypoint_count)
         }
     if estimator.locator is not None:
-        expected["locator"] = (estimator.locator, looking.locator_size, 5)
+        expected["locator"] = (estimator.locator, settings.locator_size, 5)
     words = []
     for kind, (network, size, channels) in expected.items():
         image = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from gknet.evaluation import Evaluation
-    from gknet.locate import CropEstimator
+    from gknet.dataset.skd import SkdDataset
+    from gknet.evaluation.evaluate import Evaluation
+    from gknet.inference.locate import CropEstimator
     from gknet.report.page import Section
-    from gknet.source import SkdDataset
 
 
 def evaluate(
@@ -25,16 +25,18 @@ def evaluate(
     out: Annotated[Path, typer.Option(help="Folder for metrics.json and report.html.")] = Path("evaluation"),
     pictures: Annotated[int, typer.Option(help="Pictures in each gallery of the report.")] = 6,
     threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
-    turns: Annotated[int, typer.Option(help="Look at each crop in 1, 2 or 4 orientations: surer, slower.")] = 1,
+    tta_rotations: Annotated[
+        int, typer.Option(help="Average the heatmaps of 1, 2 or 4 rotations of each crop: more accurate, slower.")
+    ] = 1,
 ) -> None:
     """Score a model on a dataset with true poses: metrics.json and a report."""
     from rich.console import Console
 
     from gknet.cli.predict import choose_estimator
+    from gknet.dataset.skd import open_dataset
     from gknet.report.table import metric_table
-    from gknet.source import open_dataset
 
-    estimator = choose_estimator(spacecraft, model, threads, turns)
+    estimator = choose_estimator(spacecraft, model, threads, tta_rotations)
     dataset = open_dataset(data, estimator.spacecraft, None if split == "all" else split, every)
     words = f"{data.resolve().name}, split {split}" + (f", every {every}th frame" if every > 1 else "")
     section = evaluate_section(dataset, estimator, words, pictures)
@@ -49,8 +51,8 @@ def evaluate(
 
 def evaluate_section(dataset: SkdDataset, estimator: CropEstimator, words: str, pictures: int) -> Section:
     """Evaluate with a progress bar, with the pictures for the page. Without a locator only the oracle's crop is run."""
-    from gknet.evaluation import PROTOCOL_WORDS, evaluate
-    from gknet.progress import progress
+    from gknet.evaluation.evaluate import PROTOCOL_WORDS, evaluate
+    from gknet.io.progress import progress
     from gknet.report.gallery import galleries
     from gknet.report.page import Section
 
@@ -66,7 +68,7 @@ def write_report(out: Path, title: str, sections: list[Section], content: dict[s
     import json
 
     from gknet import __version__
-    from gknet.atomic import write_text
+    from gknet.io.atomic import write_text
     from gknet.report.page import page
 
     metrics_path, page_path = out / "metrics.json", out / "report.html"
@@ -78,7 +80,7 @@ def write_report(out: Path, title: str, sections: list[Section], content: dict[s
 
 def tell_gaps(evaluation: Evaluation) -> None:
     """One line for each thing that the dataset does not say, and one for the frames that are in no mean."""
-    from gknet.evaluation import UNKNOWN_WORDS
+    from gknet.evaluation.evaluate import UNKNOWN_WORDS
 
     for column in evaluation.unknown:
         typer.echo(f"unknown, no column '{column}': {UNKNOWN_WORDS[column]}")

@@ -11,11 +11,11 @@ import typer
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
-    from gknet.camera_file import Lens
     from gknet.frame import Box
-    from gknet.locate import CropEstimator
-    from gknet.prediction import PredictionFiles
-    from gknet.source import Source
+    from gknet.inference.locate import CropEstimator
+    from gknet.io.camera_file import Lens
+    from gknet.predict.results import PredictionWriter
+    from gknet.predict.source import Source
 
 _SHOWN_FAILURES = 5
 
@@ -43,19 +43,21 @@ def predict(
     overlay: Annotated[bool, typer.Option("--overlay/--no-overlay", help="Write overlay pictures.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Write an overlay video.")] = False,
     threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
-    turns: Annotated[int, typer.Option(help="Look at each crop in 1, 2 or 4 orientations: surer, slower.")] = 1,
+    tta_rotations: Annotated[
+        int, typer.Option(help="Average the heatmaps of 1, 2 or 4 rotations of each crop: more accurate, slower.")
+    ] = 1,
 ) -> None:
     """Estimate the pose of a spacecraft in pictures."""
-    from gknet.prediction import STILLS_FPS, PredictionFiles
-    from gknet.source import open_source
+    from gknet.predict.results import STILLS_FPS, PredictionWriter
+    from gknet.predict.source import open_source
 
     given_box = parse_box(box)
     if given_box is not None and oracle:
         raise GknetError("--box and --oracle: give one of the two")
-    estimator = choose_estimator(spacecraft, model, threads, turns)
+    estimator = choose_estimator(spacecraft, model, threads, tta_rotations)
     source = open_source(input_path, choose_lens(camera, focal_px, hfov_deg), estimator.spacecraft, split, every)
     fps = (source.fps or STILLS_FPS) if video else None
-    with PredictionFiles(out, estimator.spacecraft, layout.value, overlay, fps) as files:
+    with PredictionWriter(out, estimator.spacecraft, layout.value, overlay, fps) as files:
         predict_all(source, estimator, files, given_box, oracle)
     tell(files)
 
@@ -77,7 +79,7 @@ def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | N
     """The one camera option that was given, or None."""
     from math import radians
 
-    from gknet.camera_file import FieldOfView, read_camera
+    from gknet.io.camera_file import FieldOfView, read_camera
 
     if sum(option is not None for option in (camera, focal_px, hfov_deg)) > 1:
         raise GknetError("--camera, --focal-px and --hfov-deg: give one of the three")
@@ -88,23 +90,25 @@ def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | N
     return FieldOfView(focal_px, None if hfov_deg is None else radians(hfov_deg))
 
 
-def choose_estimator(spacecraft: str | None, model: Path | None, threads: int | None, turns: int = 1) -> CropEstimator:
+def choose_estimator(
+    spacecraft: str | None, model: Path | None, threads: int | None, tta_rotations: int = 1
+) -> CropEstimator:
     """The shipped model of a spacecraft, or a user's folder."""
-    from gknet.estimator import load_estimator
+    from gknet.inference.estimator import load_estimator
 
     if (spacecraft is None) == (model is None):
         raise GknetError("give either --spacecraft NAME (a shipped model) or --model FOLDER")
     if threads is not None and threads < 1:
         raise GknetError(f"--threads: expected 1 or more, got {threads}")
-    return load_estimator(model or spacecraft or "", threads=threads, turns=turns)
+    return load_estimator(model or spacecraft or "", threads=threads, tta_rotations=tta_rotations)
 
 
 def predict_all(
-    source: Source, estimator: CropEstimator, files: PredictionFiles, box: Box | None = None, oracle: bool = False
+    source: Source, estimator: CropEstimator, files: PredictionWriter, box: Box | None = None, oracle: bool = False
 ) -> None:
     """Every picture of the source into the files; one that cannot be read is recorded and passed over."""
-    from gknet.progress import progress
-    from gknet.source import Unreadable
+    from gknet.frame import Unreadable
+    from gknet.io.progress import progress
 
     with progress() as bar:
         for picture in bar.track(source, total=source.count, description="poses"):
@@ -120,17 +124,19 @@ def predict_all(
             files.add(picture, estimator.estimate(picture.image, picture.camera, box))
 
 
-def tell(files: PredictionFiles) -> None:
+def tell(files: PredictionWriter) -> None:
     """The summary on standard output; GknetError when no picture gave a pose."""
-    from gknet.frame import DOUBTED_BELIEF
+    from gknet.frame import AMBIGUOUS_BELOW
 
     failures = files.failures
     if files.pose_count == 0:
         first = f"; the first, {failures[0].name}: {failures[0].reason}" if failures else ""
         raise GknetError(f"no pose in any of {files.count} pictures{first}")
     typer.echo(f"{files.pose_count} of {files.count} pictures have a pose, {len(failures)} failed")
-    if files.doubted_count:
-        typer.echo(f"  {files.doubted_count} of the poses may be a twin's: attitude_belief is below {DOUBTED_BELIEF}")
+    if files.ambiguous_count:
+        typer.echo(
+            f"  {files.ambiguous_count} of the poses may be a twin's: attitude_confidence is below {AMBIGUOUS_BELOW}"
+        )
     for failure in failures[:_SHOWN_FAILURES]:
         typer.echo(f"  {failure.name}: {failure.reason}")
     if len(failures) > _SHOWN_FAILURES:

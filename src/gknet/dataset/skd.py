@@ -15,7 +15,7 @@ from gknet.dataset.skd_sequence import SkdSequence, read_sequence, read_skeleton
 from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera
-from gknet.image import read_image
+from gknet.io.image import read_image
 from gknet.spacecraft import Spacecraft, load_spacecraft
 
 SAME_POINT_M = 1e-3
@@ -224,3 +224,14 @@ def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
         diameter_m=float(span.max()),
         description="from an SKD folder; the diameter is that of the keypoints",
     )
+
+
+def open_dataset(path: Path, spacecraft: Spacecraft, split: str | None, every: int) -> SkdDataset:
+    """The frames of `spacecraft`, whose keypoints in the dataset must be the ones given."""
+    dataset = SkdDataset(path, split, spacecraft.name, every)
+    if len(dataset) == 0:
+        raise GknetError(f"{path}: no frame of {spacecraft.name} in {f'the split {split}' if split else 'the dataset'}")
+    points = dataset.spacecraft.points_m
+    if points.shape != spacecraft.points_m.shape or np.abs(points - spacecraft.points_m).max() > SAME_POINT_M:
+        raise GknetError(f"{path}: its {spacecraft.name} has other keypoints than the model's; train a model for it")
+    return dataset

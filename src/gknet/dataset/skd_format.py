@@ -46,7 +46,7 @@ class Annotation:
     index: int
     cam_from_body: Pose
     time_s: float | None = None
-    visible: Bool[ndarray, "n"] | None = None
+    visible: Bool[ndarray, " n"] | None = None
     sun_direction: Float[ndarray, "3"] | None = None
     earth: bool | None = None
     camera: Camera | None = None
@@ -91,10 +91,6 @@ def to_skd_matrix(matrix: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
     return matrix @ P.T
 
 
-def from_skd_matrix(matrix: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
-    return matrix @ P
-
-
 def _list_text(values: ndarray) -> str:
     return "[" + ", ".join(f"{value + 0.0:.9g}" for value in np.asarray(values, dtype=float)) + "]"
 
@@ -125,7 +121,7 @@ def shown(text: str) -> str:
     return repr(text) if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]!r}..."
 
 
-def _numbers(row: dict[str, str], column: str, count: int | None, place: str) -> Float[ndarray, "n"]:
+def _numbers(row: dict[str, str], column: str, count: int | None, place: str) -> Float[ndarray, " n"]:
     """The finite numbers of a cell such as "[1, 2, 3]"."""
     text = row[column]
     expected = f"{count} numbers" if count else "numbers"

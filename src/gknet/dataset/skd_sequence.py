@@ -8,13 +8,13 @@ import operator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_matrix, from_skd_points
+from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_points
 from gknet.errors import GknetError
-from gknet.torch_file import load_torch_file
+from gknet.io.text_table import read_skd_camera_matrix, read_table
+from gknet.io.torch_file import load_torch_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
         category=category,
         rows=rows,
         indices=_indices(folder, rows),
-        camera_matrix=read_camera_matrix(own if own.exists() else root / "camera_matrix.txt"),
+        camera_matrix=read_skd_camera_matrix(own if own.exists() else root / "camera_matrix.txt"),
         points_m=from_skd_points(read_table(folder / "keypoints.txt")),
     )
 
@@ -91,37 +91,6 @@ def _indices(folder: Path, rows: tuple[dict[str, str], ...]) -> tuple[int, ...]:
     if int(last) > len(rows):
         raise GknetError(f"{path}: {len(rows)} rows, yet there is an image {last}; add a column 'frame' (from 0)")
     return tuple(range(len(rows)))
-
-
-def read_table(path: Path) -> Float[ndarray, "n 3"]:
-    """Rows of three finite numbers, separated by commas or spaces."""
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise GknetError(f"{path}: cannot read the table ({error})") from error
-    if not lines:
-        raise GknetError(f"{path}: expected rows of three numbers, found none")
-    table = np.empty((len(lines), 3))
-    for number, line in enumerate(lines, start=1):
-        try:
-            values = [float(cell) for cell in line.replace(",", " ").split()]
-        except ValueError as error:
-            raise GknetError(f"{path}: row {number}: expected three numbers, got {line.strip()!r}") from error
-        if len(values) != 3 or not np.isfinite(values).all():
-            raise GknetError(f"{path}: row {number}: expected three finite numbers, got {line.strip()!r}")
-        table[number - 1] = values
-    return table
-
-
-def read_camera_matrix(path: Path) -> Float[ndarray, "3 3"]:
-    """K in our axes."""
-    stored = read_table(path)
-    if stored.shape != (3, 3):
-        raise GknetError(f"{path}: expected a 3 x 3 matrix, got {stored.shape[0]} x {stored.shape[1]}")
-    matrix = from_skd_matrix(stored)
-    if not np.allclose(matrix[2], (0, 0, 1)):
-        raise GknetError(f"{path}: expected SKD's order of axes, [[cx, fx, 0], [cy, 0, fy], [1, 0, 0]]")
-    return matrix
 
 
 def read_skeleton(folder: Path, keypoint_count: int) -> Skeleton:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from gknet.atomic import write_bytes, write_text
 from gknet.dataset.skd_format import (
     AUTHORS_COLUMNS,
     OUR_COLUMNS,
@@ -24,7 +23,8 @@ from gknet.dataset.skd_format import (
     to_skd_points,
 )
 from gknet.geometry import Camera
-from gknet.image import write_image, write_mask
+from gknet.io.atomic import write_bytes, write_text
+from gknet.io.image import write_image, write_mask
 from gknet.spacecraft import Spacecraft
 
 

@@ -148,7 +148,7 @@ def _flat(mesh: trimesh.Trimesh) -> Float[ndarray, "c 2"]:
 
 
 def _planar(
-    triangles: Float[ndarray, "f 3 3"], axis: Int[ndarray, "f"], normals: Float[ndarray, "f 3"]
+    triangles: Float[ndarray, "f 3 3"], axis: Int[ndarray, " f"], normals: Float[ndarray, "f 3"]
 ) -> Float[ndarray, "c 2"]:
     right, up = np.array([1, 0, 0])[axis], np.array([2, 2, 1])[axis]
     row = np.arange(len(axis))

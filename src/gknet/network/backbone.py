@@ -40,7 +40,7 @@ def cell_centres(height: int, width: int, like: Tensor) -> Float[Tensor, "height
     return torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], dim=2)
 
 
-def code_of(places: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
+def fourier_encoding(places: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
     """Sines and cosines of x and y, in fractions of the picture.
 
     The same place of the picture has the same code at every resolution, so one network serves several input sizes.
@@ -49,9 +49,9 @@ def code_of(places: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
     return torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(-2)
 
 
-def position_code(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
+def position_encoding(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
     """The codes of the cells of a map."""
-    return code_of(cell_centres(height, width, like)).permute(2, 0, 1)
+    return fourier_encoding(cell_centres(height, width, like)).permute(2, 0, 1)
 
 
 class ConvNorm(nn.Module):

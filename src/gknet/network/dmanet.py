@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.errors import GknetError
-from gknet.network.attitude import AttitudeHead
-from gknet.network.backbone import POSITION_WIDTH, ConvNorm, ResidualBlock, check_input, normalised, position_code
+from gknet.network.attitude_prior import AttitudeHead
+from gknet.network.backbone import POSITION_WIDTH, ConvNorm, ResidualBlock, check_input, normalised, position_encoding
 
 KERNELS = (3, 5, 7)
 """Sides of the depthwise convolutions that look side by side in an MAB: the scales."""
@@ -35,7 +35,7 @@ class DMANetConfig:
     growth   channels that each MAB of a level adds
     blocks   MABs of each level
     head     channels of each branch
-    bins     cells of the attitude to a turn of an Euler angle (gknet.attitude.AttitudeBins)
+    bins     cells of the attitude to a turn of an Euler angle (gknet.inference.attitude.AttitudeBins)
     """
 
     width: tuple[int, int, int, int]
@@ -128,7 +128,7 @@ class DMANet(nn.Module):
         x = self.stem(normalised(image))
         for level in self.levels:
             x = level(x)
-        code = position_code(x.shape[2], x.shape[3], x)
+        code = position_encoding(x.shape[2], x.shape[3], x)
         x = x + self.place(code.permute(1, 2, 0)).permute(2, 0, 1)  # a mean over cells would forget where they are
         depth = self.depth(self.depth_cells(x).mean(dim=(2, 3)))[:, 0]
         return Branches(self._offset(self.votes(x).float()), depth.float(), self.attitude(x))
@@ -144,6 +144,6 @@ class DMANet(nn.Module):
         return (weight * (centres + votes[:, 1:]).flatten(2)).sum(dim=2)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c"]:
-        """RGB in 0 to 1 -> what `gknet.direct.decode_output` reads."""
+        """RGB in 0 to 1 -> what `gknet.inference.direct_estimator.decode_output` reads."""
         offset, log_depth, attitude = self.branches(image)
         return torch.cat([offset, log_depth[:, None], functional.softmax(attitude, dim=1)], dim=1)

@@ -10,9 +10,9 @@ from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gknet.attitude import AttitudeBins
 from gknet.errors import GknetError
-from gknet.network.attitude import AttitudeHead, AttitudePrior
+from gknet.inference.attitude import AttitudeBins
+from gknet.network.attitude_prior import AttitudeHead, AttitudePrior
 from gknet.network.backbone import (
     POSITION_WIDTH,
     ContextBlock,
@@ -21,11 +21,11 @@ from gknet.network.backbone import (
     Pyramid,
     cell_centres,
     check_input,
-    code_of,
-    position_code,
+    fourier_encoding,
+    position_encoding,
 )
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
-from gknet.network.heatmap import SHARPNESS, Branches, HeatmapNetwork, Hints, log_belief
+from gknet.network.heatmap import SHARPNESS, Branches, HeatmapNetwork, KeypointPrompts, log_probability
 
 CONVICTION = 4
 """Power to which the first look's belief is raised before the second: whoever is in two minds takes a side."""
@@ -77,7 +77,7 @@ class GKNet(HeatmapNetwork):
     ) -> None:
         super().__init__(loss, stride=4)
         self.config = config
-        self.looks_twice = config.graph != "none"
+        self.two_pass = config.graph != "none"
         self.attitude_bins = config.bins or None
         keypoints = len(adjacency)
         self.encoder = Encoder(config.width)
@@ -92,7 +92,7 @@ class GKNet(HeatmapNetwork):
         if config.bins:
             bins = AttitudeBins(config.bins)
             self.attitude = AttitudeHead(widths[3] + config.node_width, ATTITUDE_WIDTH, bins.count)
-            places, middles = bins.places(points_m, PRIOR_CELLS), bins.keypoints(points_m)
+            places, middles = bins.keypoint_prior(points_m, PRIOR_CELLS), bins.expected_keypoints(points_m)
             self.prior = AttitudePrior(torch.from_numpy(places).float(), torch.from_numpy(middles).float())
         self.decoder: GraphDecoder | None = None
         if config.graph != "none":
@@ -113,8 +113,8 @@ class GKNet(HeatmapNetwork):
         nn.init.zeros_(self.node_filter.bias)
         self.fusion = Fusion(len(adjacency))
 
-    def branches(self, image: Float[Tensor, "b 3 h w"], hints: Hints | None = None) -> Branches:
-        """The maps of both branches; `hints` are what some nodes are told before their second look."""
+    def branches(self, image: Float[Tensor, "b 3 h w"], prompts: KeypointPrompts | None = None) -> Branches:
+        """The maps of both branches; `prompts` are what some nodes are told before their second look."""
         check_input(image)
         features = self.encoder(image)
         coarse = features[3]
@@ -134,13 +134,13 @@ class GKNet(HeatmapNetwork):
 
         def glance(nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n s"]:
             # A plain sum: the fusion would be a way from node to node beside the edges.
-            return log_belief(pixels + self._node_maps(nodes, places)).exp() @ seen
+            return log_probability(pixels + self._node_maps(nodes, places)).exp() @ seen
 
         nodes = self._node_maps(self.decoder(memory, glance), places)
         first = pixels + nodes
         attitude = self._agreed(attitude, first)
         settled = self._expected(alone, attitude)
-        convinced = self._convinced(settled + nodes, hints)
+        convinced = self._convinced(settled + nodes, prompts)
         found, votes = convinced @ seen, self._votes(attitude, convinced, *alone.shape[2:])
         nodes = self._node_maps(self.decoder(memory, lambda nodes: found, votes), places)
         return Branches(self.fusion(settled, nodes), settled, nodes, first, attitude)
@@ -153,7 +153,7 @@ class GKNet(HeatmapNetwork):
         """The belief in the attitude (b, k), after a look at where the keypoints seem to be."""
         if attitude is None:
             return None
-        return attitude + self.prior.evidence(log_belief(maps.detach()).exp().reshape(maps.shape))
+        return attitude + self.prior.evidence(log_probability(maps.detach()).exp().reshape(maps.shape))
 
     def _votes(
         self, attitude: Float[Tensor, "b k"] | None, convinced: Float[Tensor, "b n hw"], height: int, width: int
@@ -162,11 +162,11 @@ class GKNet(HeatmapNetwork):
         if attitude is None:
             return None
         found = convinced.float() @ cell_centres(height, width, convinced).flatten(0, 1)
-        return code_of(self.prior.votes(attitude, found))
+        return fourier_encoding(self.prior.votes(attitude, found))
 
     def _cells(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b m c"]:
         """A map as a list of cells that know where they are."""
-        code = position_code(features.shape[2], features.shape[3], features).flatten(1).T
+        code = position_encoding(features.shape[2], features.shape[3], features).flatten(1).T
         return features.permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
 
     def _sight(self, up: Float[Tensor, "b p h w"]) -> tuple[Float[Tensor, "b p h w"], Float[Tensor, "b hw s"]]:
@@ -176,21 +176,21 @@ class GKNet(HeatmapNetwork):
         sees what is where it believes its keypoint to be (decision 0012); in the second look, where the first one put
         it, and so do its neighbours by its messages (decision 0013).
         """
-        code = position_code(up.shape[2], up.shape[3], up)
+        code = position_encoding(up.shape[2], up.shape[3], up)
         along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])
         places = functional.relu(self.pixel_features(up) + along)
         seen = torch.cat([places, code.expand(up.shape[0], -1, -1, -1)], dim=1).flatten(2).transpose(1, 2)
         return places, seen
 
     @staticmethod
-    def _convinced(maps: Float[Tensor, "b n h w"], hints: Hints | None) -> Float[Tensor, "b n hw"]:
+    def _convinced(maps: Float[Tensor, "b n h w"], prompts: KeypointPrompts | None) -> Float[Tensor, "b n hw"]:
         """Where nodes look the second time: the sharpened belief of the maps, or what they are told."""
-        belief = (CONVICTION * log_belief(maps.detach())).softmax(dim=2)
-        if hints is None:
+        belief = (CONVICTION * log_probability(maps.detach())).softmax(dim=2)
+        if prompts is None:
             return belief
-        truth = hints.maps.flatten(2)
+        truth = prompts.maps.flatten(2)
         truth = truth / truth.sum(dim=2, keepdim=True).clamp(min=1e-12)
-        return torch.where(hints.told[:, :, None], truth, belief)
+        return torch.where(prompts.told[:, :, None], truth, belief)
 
     def _node_maps(self, nodes: Float[Tensor, "b n c"], places: Float[Tensor, "b p h w"]) -> Float[Tensor, "b n h w"]:
         # (b, n, p + 1), the last one a bias; scaled so that one step moves a map by little

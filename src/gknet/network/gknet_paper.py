@@ -19,7 +19,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gknet.network.backbone import POSITION_WIDTH, ConvNorm, check_input, normalised, position_code
+from gknet.network.backbone import POSITION_WIDTH, ConvNorm, check_input, normalised, position_encoding
 from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
 from gknet.network.heatmap import Branches, HeatmapNetwork
 
@@ -88,7 +88,7 @@ class GKNetPaper(HeatmapNetwork):
 
     def _node_maps(self, coarse: Float[Tensor, "b c h w"], pixels: Tensor) -> Float[Tensor, "b n h8 w8"]:
         assert self.decoder is not None
-        code = position_code(coarse.shape[2], coarse.shape[3], coarse).flatten(1).T
+        code = position_encoding(coarse.shape[2], coarse.shape[3], coarse).flatten(1).T
         memory = self.cells(coarse).permute(0, 2, 3, 1).flatten(1, 2) + self.position(code)
         maps = self.node_map(self.decoder(memory))
         maps = maps.reshape(maps.shape[0], -1, self.map_side, self.map_side)

@@ -29,7 +29,7 @@ def checked_loss(loss: str) -> Loss:
     return loss  # type: ignore[return-value]
 
 
-def log_belief(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
+def log_probability(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
     """Logarithm of the probability that a keypoint lies in a cell."""
     return (SHARPNESS * maps.float()).flatten(2).log_softmax(dim=2)
 
@@ -39,7 +39,7 @@ def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"
 
     That average is what a training by squared error tends to as well, so both are decoded alike.
     """
-    return (2 * math.pi * SIGMA_CELLS**2 * log_belief(maps).exp()).reshape(maps.shape)
+    return (2 * math.pi * SIGMA_CELLS**2 * log_probability(maps).exp()).reshape(maps.shape)
 
 
 class Branches(NamedTuple):
@@ -56,7 +56,7 @@ class Branches(NamedTuple):
     attitude: Tensor | None = None
 
 
-class Hints(NamedTuple):
+class KeypointPrompts(NamedTuple):
     """Some keypoints' true places, told to a network in training before its second look.
 
     maps (b, n, h, w) the target Gaussians; told (b, n) bool, whose place is told
@@ -75,8 +75,8 @@ class HeatmapNetwork(nn.Module, ABC):
 
     stride: int
     input_size = 256
-    looks_twice = False
-    """Whether `branches` takes hints, as GKNet's does."""
+    two_pass = False
+    """Whether `branches` takes prompts, as GKNet's does."""
     attitude_bins: int | None = None
     """Cells to a turn of a belief in the attitude; None without one."""
 
@@ -92,9 +92,9 @@ class HeatmapNetwork(nn.Module, ABC):
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n hs ws"]:
         """RGB in 0 to 1 -> heatmaps."""
-        return self.seen(image)[0]
+        return self.predict(image)[0]
 
-    def seen(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+    def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         """Heatmaps (b, n, hs, ws) and, of a network that has one, its belief in the attitude's classes (b, k)."""
         branches = self.branches(image)
         heatmaps = expected_heatmaps(branches.fused) if self.loss == "likelihood" else branches.fused

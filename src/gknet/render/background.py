@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.geometry import Camera
+from gknet.inference.crop import Crop
 from gknet.render.earth_texture import surface
 from gknet.render.scenario import EARTH_RADIUS_M, EarthView, Shot
 from gknet.render.stars import add_stars
@@ -55,8 +55,8 @@ def background(shot: Shot, window: Crop) -> Float32[ndarray, "s s 3"]:
 class _Rays:
     """Slopes x / z and y / z of the rays through the columns' and the rows' pixel centres."""
 
-    x: Float32[ndarray, "w"]
-    y: Float32[ndarray, "h"]
+    x: Float32[ndarray, " w"]
+    y: Float32[ndarray, " h"]
 
     @property
     def squared(self) -> Float32[ndarray, "h w"]:
@@ -174,7 +174,7 @@ def _glint(
     return np.float32(0.9) * np.exp((facing - 1) / np.float32(0.012)) * np.clip(point @ sun * 4, 0, 1)
 
 
-def _every(values: Float32[ndarray, "n"], step: int) -> Float32[ndarray, "m"]:
+def _every(values: Float32[ndarray, " n"], step: int) -> Float32[ndarray, " m"]:
     """Values at the centres of `step`-wide blocks, one block more on either side."""
     spacing = values[1] - values[0] if len(values) > 1 else np.float32(0)
     blocks = -(-len(values) // step)

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.frame import Frame
-from gknet.image import write_image
+from gknet.inference.crop import Crop
+from gknet.io.image import write_image
 from gknet.spacecraft import Spacecraft
 
 TILE_PX = 256

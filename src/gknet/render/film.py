@@ -45,7 +45,7 @@ def depth(engine: Engine, scene: Any, sensor: dict[str, Any], body_from_cam: Pos
 
 def unhidden(
     engine: Engine, scene: Any, body_from_cam: Pose, points_cam: Float[ndarray, "n 3"], tolerance_m: float
-) -> Bool[ndarray, "n"]:
+) -> Bool[ndarray, " n"]:
     """Which points nothing hides that is nearer to the camera by more than the tolerance."""
     origin = engine.mi.Point3f(body_from_cam.translation_m)
     free = np.ones(len(points_cam), dtype=bool)

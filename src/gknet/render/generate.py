@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gknet import fleet
-from gknet.atomic import write_text
-from gknet.crop import Crop
 from gknet.dataset.skd_format import frame_stem, sequence_name
 from gknet.dataset.skd_sequence import read_rows
 from gknet.dataset.skd_write import write_annotations, write_camera_matrix, write_sequence_files, write_splits
 from gknet.errors import GknetError, MissingExtraError
 from gknet.geometry import Camera
-from gknet.image import is_whole_jpeg
+from gknet.inference.crop import Crop
+from gknet.io.atomic import write_text
+from gknet.io.image import is_whole_jpeg
 from gknet.render.contact_sheet import write_contact_sheet
 from gknet.render.plan import (
     DEFAULT_SIZE,
@@ -34,10 +34,10 @@ from gknet.render.plan import (
     plan_sequences,
     spacecraft_path,
 )
-from gknet.render.progress import Progress
+from gknet.render.render_log import Progress
 from gknet.render.scenario import CAMERA, Recipe, load_recipe
 from gknet.render.scene import choose_variant
-from gknet.render.worker import JOURNAL, Outcome, Studio, read_journal, render_chunk, start_worker, worker_chunk
+from gknet.render.worker import JOURNAL, Outcome, WorkerState, read_journal, render_chunk, start_worker, worker_chunk
 from gknet.spacecraft import load_spacecraft
 
 CHUNK = 8
@@ -222,8 +222,8 @@ def _outcomes(root: Path, options: Options, plans: list[SequencePlan], workers: 
         raise GknetError(f"workers: expected 1 or more, got {workers}")
     chunks = _chunks(plans)
     if workers == 1:
-        studio = Studio(root, options, variant)
-        yield from (render_chunk(studio, chunk) for chunk in chunks)
+        state = WorkerState(root, options, variant)
+        yield from (render_chunk(state, chunk) for chunk in chunks)
         return
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), initializer=start_worker, initargs=(root, options, variant)

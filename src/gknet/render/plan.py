@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Box
+from gknet.inference.crop import Crop
 from gknet.render.scenario import Recipe, Shot
 
 WINDOWS = ("frame", "target")

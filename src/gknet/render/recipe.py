@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from gknet.errors import GknetError
 
 Split = Literal["train", "val", "test"]
-SPLITS: tuple[Split, ...] = ("train", "val", "train", "test", "train")
+SPLIT_CYCLE: tuple[Split, ...] = ("train", "val", "train", "test", "train")
 """The splits of a spacecraft's consecutive sequences: 3:1:1."""
 
 Fraction = Annotated[FiniteFloat, Field(ge=0, le=1)]
@@ -62,7 +62,7 @@ class Motion(_Part):
     step_deg: tuple[Positive, Positive]
 
 
-class Light(_Part):
+class LightLimits(_Part):
     """Orbit, Earth and sun. `phase_deg` is the angle at the spacecraft between the sun and the camera.
 
     earth_fraction   part of the sequences that have the Earth in view
@@ -105,7 +105,7 @@ class Recipe(_Part):
     frames: Annotated[int, Field(gt=0)]
     spacecraft: Annotated[tuple[str, ...], Field(min_length=1)]
     motion: Motion
-    light: Light
+    light: LightLimits
     detector: Detector
 
     def spacecraft_of(self, sequence: int) -> str:
@@ -114,7 +114,7 @@ class Recipe(_Part):
 
     def split_of(self, sequence: int) -> Split:
         self._check(sequence)
-        return SPLITS[sequence // len(self.spacecraft) % len(SPLITS)]
+        return SPLIT_CYCLE[sequence // len(self.spacecraft) % len(SPLIT_CYCLE)]
 
     @property
     def key(self) -> int:

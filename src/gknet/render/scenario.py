@@ -12,7 +12,7 @@ from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
 from gknet.render.recipe import RECIPES, Recipe, load_recipe
 from gknet.render.sensor import Sensor
-from gknet.render.sequence import CAMERA, EARTH_RADIUS_M, Solved, solve
+from gknet.render.sequence import CAMERA, EARTH_RADIUS_M, SequenceMotion, sample_sequence
 from gknet.render.trajectory import band_limited
 from gknet.spacecraft import Spacecraft
 
@@ -59,7 +59,7 @@ def shoot(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, inde
         raise GknetError(f"sequence: expected 0 to {recipe.sequences - 1} in recipe {recipe.name}, got {sequence}")
     if not 0 <= index < recipe.frames:
         raise GknetError(f"frame: expected 0 to {recipe.frames - 1} in recipe {recipe.name}, got {index}")
-    solved = solve(recipe, spacecraft, seed, sequence)
+    solved = sample_sequence(recipe, spacecraft, seed, sequence)
     planet = EarthView(solved.earth_centre_cam_m[index], solved.cam_from_earth[index])
     noise_seed = np.random.SeedSequence([seed, recipe.key, sequence, index]).generate_state(1)[0]
     return Shot(
@@ -79,7 +79,7 @@ def shoot(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, inde
     )
 
 
-def _sensor(recipe: Recipe, solved: Solved, seed: int, sequence: int, index: int) -> Sensor:
+def _sensor(recipe: Recipe, solved: SequenceMotion, seed: int, sequence: int, index: int) -> Sensor:
     """A camera for the sequence, an exposure for the frame."""
     detector = recipe.detector
     rng = np.random.default_rng([seed, recipe.key, sequence, 2**31])

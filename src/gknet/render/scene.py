@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.render import film
 from gknet.render.materials import build_shapes, read_glb
 from gknet.render.scenario import EARTH_RADIUS_M, Shot
@@ -42,7 +42,7 @@ class Rendered:
     alpha: Float32[ndarray, "s s"]
     mask: Bool[ndarray, "s s"]
     depth_m: Float32[ndarray, "s s"]
-    visible: Bool[ndarray, "n"]
+    visible: Bool[ndarray, " n"]
 
 
 class Renderer:
@@ -104,7 +104,7 @@ class Renderer:
 
     def _unhidden(
         self, engine: Engine, body_from_cam: Pose, points_cam: Float[ndarray, "n 3"], tolerance_m: float
-    ) -> Bool[ndarray, "n"]:
+    ) -> Bool[ndarray, " n"]:
         if self._shader is None:
             return film.unhidden(engine, self._scene, body_from_cam, points_cam, tolerance_m)
         return self._shader.unhidden(body_from_cam, points_cam, tolerance_m)

@@ -103,7 +103,7 @@ def _with_noise(signal: Float32[ndarray, "..."], sensor: Sensor, scale: float, s
     return signal + noise * spread * np.float32(min(scale, 1.0))
 
 
-def _tone(gamma: float) -> UInt8[ndarray, "levels"]:
+def _tone(gamma: float) -> UInt8[ndarray, " levels"]:
     """The 8-bit value of each level of the signal."""
     levels = np.arange(_LEVELS) / (_LEVELS - 1)
     return np.round(255 * levels ** (1 / gamma)).astype(np.uint8)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from gknet.errors import GknetError
 from gknet.geometry import Camera
 from gknet.render import trajectory
-from gknet.render.recipe import Light, Motion, Recipe
+from gknet.render.recipe import LightLimits, Motion, Recipe
 from gknet.spacecraft import Spacecraft
 
 CAMERA = Camera.from_focal(1400.0, 1024, 1024)
@@ -45,7 +45,7 @@ _EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 
 
 @dataclass(frozen=True)
-class Wish:
+class SequenceSpec:
     """What a sequence is about."""
 
     kind: Kind
@@ -54,26 +54,26 @@ class Wish:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SequenceMotion:
     """The geometry of a sequence's `t` frames."""
 
-    wish: Wish
-    time_s: Float[ndarray, "t"]
+    spec: SequenceSpec
+    time_s: Float[ndarray, " t"]
     cam_from_body: Float[ndarray, "t 3 3"]
     body_cam_m: Float[ndarray, "t 3"]
     cam_from_inertial: Float[ndarray, "t 3 3"]
     cam_from_earth: Float[ndarray, "t 3 3"]
     earth_centre_cam_m: Float[ndarray, "t 3"]
-    earth_in_view: Bool[ndarray, "t"]
+    earth_in_view: Bool[ndarray, " t"]
     sun_direction: Float[ndarray, "t 3"]
-    phase_rad: Float[ndarray, "t"]
+    phase_rad: Float[ndarray, " t"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Orbit:
     """The spacecraft's orbit: LVLH at each time, and the Earth's angular radius seen from it."""
 
-    time_s: Float[ndarray, "t"]
+    time_s: Float[ndarray, " t"]
     rate: float
     radius_m: float
     inertial_from_lvlh: Float[ndarray, "t 3 3"]
@@ -83,7 +83,7 @@ class _Orbit:
         return float(np.arcsin(EARTH_RADIUS_M / self.radius_m))
 
 
-def wish_of(recipe: Recipe, seed: int, sequence: int) -> Wish:
+def sequence_spec(recipe: Recipe, seed: int, sequence: int) -> SequenceSpec:
     craft, turn = sequence % len(recipe.spacecraft), sequence // len(recipe.spacecraft)
     shift = np.random.default_rng([seed, recipe.key, craft]).random(3)
     u = (shift + turn * _EVEN) % 1.0
@@ -100,16 +100,16 @@ def wish_of(recipe: Recipe, seed: int, sequence: int) -> Wish:
     low, high = light.phase_deg
     if scene == "earth_fills":
         high = max(low, min(high, _FILLS_PHASE_DEG))
-    return Wish(kind, scene, float(np.radians(low + u[1] * (high - low))))
+    return SequenceSpec(kind, scene, float(np.radians(low + u[1] * (high - low))))
 
 
 @lru_cache(maxsize=8)
-def solve(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int) -> Solved:
+def sample_sequence(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int) -> SequenceMotion:
     """The first candidate that obeys the recipe. The same arguments give the same sequence."""
-    wish = wish_of(recipe, seed, sequence)
+    spec = sequence_spec(recipe, seed, sequence)
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, recipe.key, sequence, attempt])
-        solved = _candidate(recipe, spacecraft, wish, rng)
+        solved = _candidate(recipe, spacecraft, spec, rng)
         if solved is not None:
             return solved
     raise GknetError(
@@ -118,15 +118,17 @@ def solve(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int) -> S
     )
 
 
-def _candidate(recipe: Recipe, spacecraft: Spacecraft, wish: Wish, rng: np.random.Generator) -> Solved | None:
+def _candidate(
+    recipe: Recipe, spacecraft: Spacecraft, spec: SequenceSpec, rng: np.random.Generator
+) -> SequenceMotion | None:
     """A sequence drawn from the recipe, or None when it breaks a limit. Cheap checks come first."""
     motion = recipe.motion
     spin = np.radians(_log_uniform(rng, motion.tumble_deg_s))
     orbit = _orbit(recipe, np.degrees(spin), rng)
-    path = _path(wish, motion, orbit, rng)
+    path = _path(spec, motion, orbit, rng)
     if path is None:
         return None
-    sun = _sun(wish, recipe.light, orbit, path, rng)
+    sun = _sun(spec, recipe.light, orbit, path, rng)
     if sun is None:
         return None
     centre = (spacecraft.points_m.min(axis=0) + spacecraft.points_m.max(axis=0)) / 2
@@ -145,12 +147,12 @@ def _candidate(recipe: Recipe, spacecraft: Spacecraft, wish: Wish, rng: np.rando
         return None
     earth_cam = _turn(cam_from_lvlh, -path - orbit.radius_m * np.array([1.0, 0, 0]))
     in_view = earth_in_view(earth_cam)
-    if in_view.any() if wish.scene == "sky" else in_view.mean() < 0.9:
+    if in_view.any() if spec.scene == "sky" else in_view.mean() < 0.9:
         return None
     cam_from_inertial = cam_from_lvlh @ orbit.inertial_from_lvlh.transpose(0, 2, 1)
     chaser = _turn(orbit.inertial_from_lvlh, path / np.linalg.norm(path, axis=1, keepdims=True))
-    return Solved(
-        wish=wish,
+    return SequenceMotion(
+        spec=spec,
         time_s=orbit.time_s,
         cam_from_body=cam_from_body,
         body_cam_m=body_cam,
@@ -183,20 +185,20 @@ def _orbit(recipe: Recipe, spin_deg_s: float, rng: np.random.Generator) -> _Orbi
     return _Orbit(time_s, rate, radius, trajectory.orbit_frames(rate, time_s, plane))
 
 
-def _path(wish: Wish, motion: Motion, orbit: _Orbit, rng: np.random.Generator) -> Float[ndarray, "t 3"] | None:
+def _path(spec: SequenceSpec, motion: Motion, orbit: _Orbit, rng: np.random.Generator) -> Float[ndarray, "t 3"] | None:
     """The chaser in LVLH, at a scale of its own, with the Earth where it is wished."""
-    if wish.kind == "fly_around":
+    if spec.kind == "fly_around":
         angles = rng.uniform(0, 2 * np.pi, size=2)
         path = trajectory.fly_around(orbit.rate, orbit.time_s, 1.0, rng.uniform(0, 2.5), (angles[0], angles[1]))
     else:
-        direction = _direction(wish.scene, orbit.earth_angle, rng)
-        if wish.kind == "hold":
+        direction = _direction(spec.scene, orbit.earth_angle, rng)
+        if spec.kind == "hold":
             path = trajectory.hold(orbit.time_s, direction, rng.uniform(0.0, 0.1), rng)
         else:
             aside = np.cross(direction, trajectory.random_direction(rng)) * np.tan(np.radians(rng.uniform(0, 35)))
             start = (direction + aside) / np.linalg.norm(direction + aside) * _log_uniform(rng, motion.approach_ratio)
             path = trajectory.approach(orbit.rate, orbit.time_s, start, direction)
-    return path if _scene_holds(wish.scene, orbit.earth_angle, path) else None
+    return path if _scene_holds(spec.scene, orbit.earth_angle, path) else None
 
 
 def _direction(scene: Scene, earth_angle: float, rng: np.random.Generator) -> Float[ndarray, "3"]:
@@ -225,7 +227,7 @@ def _scene_holds(scene: Scene, earth_angle: float, path: Float[ndarray, "t 3"]) 
 
 
 def _sun(
-    wish: Wish, light: Light, orbit: _Orbit, path: Float[ndarray, "t 3"], rng: np.random.Generator
+    spec: SequenceSpec, light: LightLimits, orbit: _Orbit, path: Float[ndarray, "t 3"], rng: np.random.Generator
 ) -> Float[ndarray, "3"] | None:
     """Unit vector to the sun in the inertial frame: the wished phase angle at mid-sequence, no eclipse."""
     chaser = _turn(orbit.inertial_from_lvlh, path / np.linalg.norm(path, axis=1, keepdims=True))
@@ -234,18 +236,18 @@ def _sun(
     aside /= np.linalg.norm(aside)
     azimuths = rng.permutation(32) * (2 * np.pi / 32)
     ring = np.outer(np.cos(azimuths), aside) + np.outer(np.sin(azimuths), np.cross(middle, aside))
-    suns = np.cos(wish.phase_rad) * middle + np.sin(wish.phase_rad) * ring
+    suns = np.cos(spec.phase_rad) * middle + np.sin(spec.phase_rad) * ring
     phase = np.degrees(np.arccos(np.clip(chaser @ suns.T, -1, 1)))
     height = orbit.inertial_from_lvlh[:, :, 0] @ suns.T
     lit = (height > 0) | (1 - height**2 > (EARTH_RADIUS_M / orbit.radius_m) ** 2)
     good = (lit & (phase >= light.phase_deg[0]) & (phase <= light.phase_deg[1])).all(axis=0)
     day = good & (height > _DAYLIGHT).all(axis=0)
-    if wish.scene != "sky" and day.any():
+    if spec.scene != "sky" and day.any():
         good = day
     return suns[np.argmax(good)] if good.any() else None
 
 
-def _attitude(spin_rad_s: float, time_s: Float[ndarray, "t"], rng: np.random.Generator) -> Float[ndarray, "t 3 3"]:
+def _attitude(spin_rad_s: float, time_s: Float[ndarray, " t"], rng: np.random.Generator) -> Float[ndarray, "t 3 3"]:
     """inertial_from_body of a free tumble; principal axes lie anyhow in the body."""
     start = trajectory.random_rotation(rng).as_quat()[[3, 0, 1, 2]]
     spin = spin_rad_s * trajectory.random_direction(rng)
@@ -274,7 +276,7 @@ def _mispointing(
     points: Float[ndarray, "n 3"],
     path: Float[ndarray, "t 3"],
     motion: Motion,
-    time_s: Float[ndarray, "t"],
+    time_s: Float[ndarray, " t"],
     rng: np.random.Generator,
 ) -> Float[ndarray, "t 3 3"]:
     """Rotations of the camera: a smooth pointing error that uses the room beside the spacecraft, and some roll."""
@@ -311,7 +313,7 @@ def obeys(motion: Motion, points_cam_m: Float[ndarray, "t n 3"]) -> bool:
     )
 
 
-def earth_in_view(centre_cam_m: Float[ndarray, "t 3"]) -> Bool[ndarray, "t"]:
+def earth_in_view(centre_cam_m: Float[ndarray, "t 3"]) -> Bool[ndarray, " t"]:
     """Whether a ray of the full image, on a grid that includes its border, meets the Earth or its lower atmosphere."""
     side = (np.linspace(0, CAMERA.width, 17) - CAMERA.matrix[0, 2]) / CAMERA.matrix[0, 0]
     rays = np.stack([*np.meshgrid(side, side), np.ones((17, 17))], axis=-1).reshape(-1, 3)
@@ -321,6 +323,6 @@ def earth_in_view(centre_cam_m: Float[ndarray, "t 3"]) -> Bool[ndarray, "t"]:
     return ((along > 0) & (beside < (EARTH_RADIUS_M + 40e3) ** 2)).any(axis=1)
 
 
-def _inertial_from_earth(time_s: Float[ndarray, "t"], rng: np.random.Generator) -> Float[ndarray, "t 3 3"]:
+def _inertial_from_earth(time_s: Float[ndarray, " t"], rng: np.random.Generator) -> Float[ndarray, "t 3 3"]:
     angle = rng.uniform(0, 2 * np.pi) + EARTH_RATE_RAD_S * time_s
     return Rotation.from_rotvec(angle[:, None] * np.array([0.0, 0, 1])).as_matrix()

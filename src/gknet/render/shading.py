@@ -104,7 +104,7 @@ class Shader:
 
     def unhidden(
         self, body_from_cam: Pose, points_cam: Float[ndarray, "n 3"], tolerance_m: float
-    ) -> Bool[ndarray, "n"]:
+    ) -> Bool[ndarray, " n"]:
         """Which points nothing hides that is nearer to the camera by more than the tolerance."""
         mi = self._engine.mi
         length = np.linalg.norm(points_cam, axis=1)
@@ -120,7 +120,7 @@ class Shader:
         self._engine.dr.eval(index)
         return index
 
-    def _numbers(self, values: Float[ndarray, "n"]) -> list[Any]:
+    def _numbers(self, values: Float[ndarray, " n"]) -> list[Any]:
         return [self._engine.dr.opaque(self._engine.mi.Float, float(value), 1) for value in values]
 
     def _integers(self, *values: int) -> list[Any]:

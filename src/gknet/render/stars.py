@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.errors import MissingExtraError
 from gknet.geometry import Camera
+from gknet.inference.crop import Crop
 
 SUN_MAGNITUDE = -26.74
 FAINTEST = 6.5
@@ -45,12 +45,12 @@ def catalogue() -> Stars:
     return Stars(directions, total[:, None] * _tint(_column(lines, _COLOUR)))
 
 
-def _column(lines: ndarray, columns: slice) -> Float[ndarray, "n"]:
+def _column(lines: ndarray, columns: slice) -> Float[ndarray, " n"]:
     width = columns.stop - columns.start
     return np.ascontiguousarray(lines[:, columns]).view(f"S{width}")[:, 0].astype(np.float64)
 
 
-def _tint(colour_index: Float[ndarray, "n"]) -> Float[ndarray, "n 3"]:
+def _tint(colour_index: Float[ndarray, " n"]) -> Float[ndarray, "n 3"]:
     """RGB with mean 1 from B-V: the colour of a black body at Ballesteros' temperature, against the sun's."""
     index = np.clip(colour_index, -0.3, 2.0)
     kelvin = 4600 * (1 / (0.92 * index + 1.7) + 1 / (0.92 * index + 0.62))

@@ -19,7 +19,7 @@ from gknet.errors import GknetError
 GRAVITY_M3_S2 = 3.986004418e14
 """The Earth's gravitational parameter."""
 
-Times = Float[ndarray, "t"]
+Times = Float[ndarray, " t"]
 Path = Float[ndarray, "t 3"]
 
 

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.dataset.skd_format import Annotation, category_of, row_of, sequence_name
 from gknet.dataset.skd_write import write_frame_files
 from gknet.geometry import Camera
+from gknet.inference.crop import Crop
 from gknet.render.background import background
 from gknet.render.plan import Options, SequencePlan, spacecraft_path, window_of
 from gknet.render.scenario import Shot, shoot
@@ -30,13 +30,13 @@ JOURNAL = "journal.jsonl"
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedFrame:
     """A finished frame: what is written to disk."""
 
     rgb: UInt8[ndarray, "s s 3"]
     mask: Bool[ndarray, "s s"]
     depth_m: Float[ndarray, "s s"]
-    visible: Bool[ndarray, "n"]
+    visible: Bool[ndarray, " n"]
     camera: Camera
 
 
@@ -50,7 +50,7 @@ class Outcome:
 
 
 @dataclass
-class Studio:
+class WorkerState:
     """The renderers of a process, one for each spacecraft, made when first needed.
 
     threads   of this process, None for all cores
@@ -69,7 +69,7 @@ class Studio:
         return self.renderers[name]
 
 
-def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: Crop) -> Picture:
+def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: Crop) -> RenderedFrame:
     """The picture of `window` as the sensor gives it: black beyond its edge, as where a crop leaves an image."""
     rendered = renderer.render(shot, window)
     radiance = background(shot, window)
@@ -82,7 +82,7 @@ def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: 
         rgb = np.where(inside[..., None], rgb, np.uint8(0))
         mask, depth_m = mask & inside, np.where(inside, depth_m, np.float32(0))
     pixels = shot.camera.project(shot.cam_from_body.transform(spacecraft.points_m))
-    return Picture(
+    return RenderedFrame(
         rgb=rgb,
         mask=mask,
         depth_m=depth_m,
@@ -98,14 +98,14 @@ def _on_sensor(window: Crop, camera: Camera) -> Bool[ndarray, "s s"]:
     return ((y >= 0) & (y <= camera.height))[:, None] & ((x >= 0) & (x <= camera.width))[None]
 
 
-def render_frame(studio: Studio, name: str, sequence: int, index: int) -> dict[str, str]:
+def render_frame(state: WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
     """Render one frame and write its files; its label row."""
-    options = studio.options
-    spacecraft, renderer = studio.renderer(name)
+    options = state.options
+    spacecraft, renderer = state.renderer(name)
     shot = shoot(options.recipe, spacecraft, options.seed, sequence, index)
     picture = render_shot(renderer, spacecraft, shot, window_of(options, shot, spacecraft.points_m))
     write_frame_files(
-        studio.out / sequence_name(sequence),
+        state.out / sequence_name(sequence),
         index,
         picture.rgb,
         shot.sensor.jpeg_quality,
@@ -128,13 +128,13 @@ def render_frame(studio: Studio, name: str, sequence: int, index: int) -> dict[s
     )
 
 
-def render_chunk(studio: Studio, plan: SequencePlan) -> Outcome:
+def render_chunk(state: WorkerState, plan: SequencePlan) -> Outcome:
     """Render the frames of a plan; a frame that fails is reported and the others go on, a full disk ends it all."""
-    journal = studio.out / sequence_name(plan.sequence) / JOURNAL
+    journal = state.out / sequence_name(plan.sequence) / JOURNAL
     failures = []
     for index in plan.indices:
         try:
-            append_row(journal, render_frame(studio, plan.spacecraft, plan.sequence, index))
+            append_row(journal, render_frame(state, plan.spacecraft, plan.sequence, index))
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
                 raise
@@ -172,17 +172,17 @@ def read_journal(journal: Path) -> Iterable[dict[str, str]]:
             yield row
 
 
-_studio: Studio | None = None
+_state: WorkerState | None = None
 
 
 def start_worker(out: Path, options: Options, variant: str) -> None:
-    """Called once in each worker process: one thread each, and a studio of its own."""
-    global _studio
+    """Called once in each worker process: one thread each, and a state of its own."""
+    global _state
     cv2.setNumThreads(1)
-    _studio = Studio(out, options, variant, threads=1)
+    _state = WorkerState(out, options, variant, threads=1)
 
 
 def worker_chunk(plan: SequencePlan) -> Outcome:
-    if _studio is None:
+    if _state is None:
         raise RuntimeError("start_worker was not called in this process")
-    return render_chunk(_studio, plan)
+    return render_chunk(_state, plan)

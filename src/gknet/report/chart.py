@@ -24,10 +24,10 @@ class Series:
     """One curve. With `low` and `high` (k,) its points carry whiskers."""
 
     name: str
-    x: Float[ndarray, "k"]
-    y: Float[ndarray, "k"]
-    low: Float[ndarray, "k"] | None = None
-    high: Float[ndarray, "k"] | None = None
+    x: Float[ndarray, " k"]
+    y: Float[ndarray, " k"]
+    low: Float[ndarray, " k"] | None = None
+    high: Float[ndarray, " k"] | None = None
 
 
 @dataclass(frozen=True)

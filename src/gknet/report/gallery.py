@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
-from gknet.evaluation import Case, Run
+from gknet.evaluation.evaluate import Case, ProtocolRun
 from gknet.frame import Frame
+from gknet.inference.crop import Crop
 from gknet.report.overlay import draw_overlay, zoomed
 from gknet.spacecraft import Spacecraft
 
@@ -26,7 +26,7 @@ _WEIGHT = 1.6
 
 
 @dataclass(frozen=True)
-class Picture:
+class GalleryPicture:
     """A captioned JPEG as a data URI."""
 
     data_uri: str
@@ -37,10 +37,10 @@ class Picture:
 @dataclass(frozen=True)
 class Gallery:
     title: str
-    pictures: tuple[Picture, ...]
+    pictures: tuple[GalleryPicture, ...]
 
 
-def galleries(run: Run, dataset: SkdDataset, spacecraft: Spacecraft, count: int = 6) -> tuple[Gallery, ...]:
+def galleries(run: ProtocolRun, dataset: SkdDataset, spacecraft: Spacecraft, count: int = 6) -> tuple[Gallery, ...]:
     """Worst, random and best by the SPEED score; a frame appears in one gallery only."""
     order = sorted(run.cases, key=lambda case: (-case.errors.speed_score, case.index))
     worst = order[:count]
@@ -62,7 +62,7 @@ def data_uri(image: UInt8[ndarray, "h w 3"], quality: int = _QUALITY) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
-def _picture(case: Case, dataset: SkdDataset, spacecraft: Spacecraft) -> Picture:
+def _picture(case: Case, dataset: SkdDataset, spacecraft: Spacecraft) -> GalleryPicture:
     frame = dataset.frame(case.index)
     image = _overlay(frame, case, spacecraft)
     found = case.errors
@@ -77,7 +77,7 @@ def _picture(case: Case, dataset: SkdDataset, spacecraft: Spacecraft) -> Picture
         words.append(f"E_t {found.e_t:.4f}, E_q {found.e_q_rad:.4f} rad ({math.degrees(found.e_q_rad):.1f}°)")
     if found.rmse_px is not None:
         words.append(f"RMSE {found.rmse_px:.1f} px")
-    return Picture(data_uri(image), case.frame_name, ", ".join(words))
+    return GalleryPicture(data_uri(image), case.frame_name, ", ".join(words))
 
 
 def _overlay(frame: Frame, case: Case, spacecraft: Spacecraft) -> UInt8[ndarray, "h w 3"]:

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gknet.crop import Crop
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Frame, Keypoints
 from gknet.geometry import Camera, Pose
+from gknet.inference.crop import Crop
 from gknet.report.canvas import Canvas, enlarged
 from gknet.report.palette import BLUE, GREEN, PINK, RGB, SKY, VERMILLION, WHITE, score_colour
 from gknet.spacecraft import Spacecraft
@@ -76,9 +76,9 @@ def describe(frame: Frame, estimate: Estimate) -> list[str]:
     sure = confidence(estimate)
     if sure is not None and estimate.inliers is not None:
         lines.append(f"confidence {sure:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
-    if estimate.attitude_belief is not None:
-        doubt = ", perhaps a twin" if estimate.is_doubted else ""
-        lines.append(f"belief in the attitude {estimate.attitude_belief:.2f}{doubt}")
+    if estimate.attitude_confidence is not None:
+        doubt = ", perhaps a twin" if estimate.is_ambiguous else ""
+        lines.append(f"belief in the attitude {estimate.attitude_confidence:.2f}{doubt}")
     if estimate.reprojection_rms_px is not None:
         lines.append(f"reprojection {estimate.reprojection_rms_px:.2f} px rms")
     return lines

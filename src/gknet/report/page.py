@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from html import escape
 
 from gknet import __version__
-from gknet.evaluation import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, Run
-from gknet.metrics import Statistic
+from gknet.evaluation.evaluate import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, ProtocolRun
+from gknet.evaluation.metrics import Statistic
 from gknet.report.chart import page_style
 from gknet.report.gallery import Gallery
 from gknet.report.plots import charts
@@ -110,7 +110,7 @@ def _metric_table(evaluation: Evaluation) -> str:
     )
 
 
-def _metric_cells(run: Run, metric: str, digits: int) -> str:
+def _metric_cells(run: ProtocolRun, metric: str, digits: int) -> str:
     found = statistic(run, metric)
     if found is None:
         return "<td>-</td><td>-</td>"

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gknet.evaluation import PROTOCOL_WORDS, Evaluation, Run, keypoint_statistics
-from gknet.metrics import Bin
+from gknet.evaluation.evaluate import PROTOCOL_WORDS, Evaluation, ProtocolRun, keypoint_statistics
+from gknet.evaluation.metrics import Bin
 from gknet.report.chart import Axis, Series, bar_chart, curve_chart
 
 _LEAST = {"rmse_px": 0.1, "e_t": 1e-4, "e_q_rad": 1e-3}
@@ -30,8 +30,12 @@ def charts(evaluation: Evaluation) -> list[str]:
     for by, words, label, unit in conditions:
         drawn.append(_by_condition(evaluation, by, f"RMSE by {words}", label, "rmse_px", "mean RMSE in px", unit))
         drawn.append(_by_condition(evaluation, by, f"E_q by {words}", label, "e_q_rad", "mean E_q in rad", unit))
-    if any(b.by == "attitude_belief" for run in evaluation.runs for b in run.summary.bins):
-        by, words, label = "attitude_belief", "E_q by the belief in the attitude", "belief in attitudes like the pose's"
+    if any(b.by == "attitude_confidence" for run in evaluation.runs for b in run.summary.bins):
+        by, words, label = (
+            "attitude_confidence",
+            "E_q by the belief in the attitude",
+            "belief in attitudes like the pose's",
+        )
         drawn.append(_by_condition(evaluation, by, words, label, "e_q_rad", "mean E_q in rad", lambda value: value))
     drawn.append(_by_background(evaluation, "RMSE by background", "rmse_px", "mean RMSE in px"))
     drawn.append(_by_background(evaluation, "E_q by background", "e_q_rad", "mean E_q in rad"))
@@ -63,7 +67,7 @@ def _by_condition(
     return curve_chart(title, Axis(label), Axis(f"{value}, 95 % interval", low=0.0), series)
 
 
-def _binned(run: Run, by: str, metric: str, unit: Callable[[float], float]) -> Series:
+def _binned(run: ProtocolRun, by: str, metric: str, unit: Callable[[float], float]) -> Series:
     bins = [b for b in run.summary.bins if b.by == by and metric in b.metrics]
     found = [b.metrics[metric] for b in bins]
     return Series(
@@ -89,7 +93,7 @@ def _by_background(evaluation: Evaluation, title: str, metric: str, value: str) 
     return bar_chart(title, Axis(f"{value}, 95 % interval", low=0.0), ("black sky", "Earth in view"), series)
 
 
-def _middle(run: Run, bin_: Bin) -> float:
+def _middle(run: ProtocolRun, bin_: Bin) -> float:
     """The median of the frames in the bin: an open bin has no middle."""
     values = [getattr(case.errors, bin_.by) for case in run.cases]
     inside = [v for v in values if v is not None and bin_.low <= v <= bin_.high]

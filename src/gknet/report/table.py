@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
-from gknet.evaluation import Evaluation, Run
-from gknet.metrics import Statistic
+from gknet.evaluation.evaluate import Evaluation, ProtocolRun
+from gknet.evaluation.metrics import Statistic
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ COUNT_MEANINGS = (
 )
 
 
-def statistic(run: Run, metric: str) -> Statistic | None:
+def statistic(run: ProtocolRun, metric: str) -> Statistic | None:
     """A metric of a run; the oracle's box is the truth itself, so its overlap says nothing."""
     if run.protocol == "oracle" and metric == "locator_iou":
         return None
@@ -69,7 +69,7 @@ def median_text(found: Statistic | None, digits: int) -> str:
     return "-" if found is None else f"{found.median:.{digits}f}"
 
 
-def failure_count(run: Run) -> int:
+def failure_count(run: ProtocolRun) -> int:
     return sum(run.summary.failures.values())
 
 

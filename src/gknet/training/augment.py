@@ -78,7 +78,7 @@ def warp_image(image: UInt8[ndarray, "h w 3"], matrix: Float[ndarray, "3 3"], si
 def craft_warp(
     rng: np.random.Generator,
     points: Float[ndarray, "n 2"],
-    in_view: Bool[ndarray, "n"],
+    in_view: Bool[ndarray, " n"],
     size: int,
     ranges: Augmentation,
 ) -> Float[ndarray, "3 3"]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from gknet.direct import CropPose
+from gknet.inference.direct_estimator import CropPose
 from gknet.training.augment import (
     Augmentation,
     PictureAugmentation,
@@ -31,7 +31,7 @@ AHEAD = 3
 """Batches prepared ahead of the loop."""
 
 TOLD_OF, MOST_TOLD = 0.5, 0.6
-"""Share of the pictures with hints, and the largest share of such a picture's keypoints that are told."""
+"""Share of the pictures with prompts, and the largest share of such a picture's keypoints that are told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class Sample:
 
     image: UInt8[ndarray, "s s 3"]
     points_px: Float[ndarray, "k 2"]
-    weight: Float[ndarray, "k"]
-    told: Bool[ndarray, "k"]
+    weight: Float[ndarray, " k"]
+    told: Bool[ndarray, " k"]
     pose: Float[ndarray, "7"]
 
 
@@ -111,7 +111,7 @@ def _warped_pose(cache: Cache, row: int, matrix: Float[ndarray, "3 3"], size: in
     return vector.astype(np.float32)
 
 
-def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, "n"]:
+def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, " n"]:
     return np.all((points >= 0) & (points <= size), axis=1)
 
 
@@ -173,7 +173,7 @@ class Loader:
 
 
 @lru_cache(maxsize=2)
-def _order(seed: int, epoch: int, count: int) -> Int[ndarray, "count"]:
+def _order(seed: int, epoch: int, count: int) -> Int[ndarray, " count"]:
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 

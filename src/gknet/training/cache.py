@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from gknet.crop import Crop
-from gknet.direct import CropPose, has_square_pixels
 from gknet.errors import GknetError
 from gknet.frame import Box, Frame
+from gknet.inference.crop import Crop
+from gknet.inference.direct_estimator import CropPose, has_square_pixels
 from gknet.spacecraft import Spacecraft
 
-MARGIN = 1.6
+CACHE_MARGIN = 1.6
 """A cached crop's side over the longer side of the keypoints' box: room to turn and to shift."""
 
 WHOLE = 0.8
@@ -76,13 +76,13 @@ def whole_picture(frame: Frame, size: int) -> Crop:
 def craft_window(frame: Frame, box: Box, size: int) -> Crop:
     """The square around the craft, or the whole picture when that is hardly more."""
     whole = whole_picture(frame, size)
-    around = Crop.around(box, size, MARGIN)
+    around = Crop.around(box, size, CACHE_MARGIN)
     return whole if around.side >= WHOLE * whole.side else around
 
 
 def _label_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size: int, stamp: str) -> str:
     """A name for the cache that changes with anything that it was made of."""
-    digest = hashlib.sha256(f"{LAYOUT} {window} {size} {MARGIN} {WHOLE} {stamp}".encode())
+    digest = hashlib.sha256(f"{LAYOUT} {window} {size} {CACHE_MARGIN} {WHOLE} {stamp}".encode())
     digest.update(np.append(spacecraft.points_m, spacecraft.diameter_m).tobytes())
     for i in range(len(frames)):
         try:
@@ -101,7 +101,7 @@ def _label_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size
 class _Row:
     image: UInt8[ndarray, "s s 3"]
     points_px: Float[ndarray, "n 2"]
-    in_view: Bool[ndarray, "n"]
+    in_view: Bool[ndarray, " n"]
     box_px: Float[ndarray, "4"]
     pose: Float[ndarray, "7"]
 

@@ -13,16 +13,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, nn
 
-from gknet.atomic import write_bytes
 from gknet.errors import GknetError
-from gknet.torch_file import load_torch_file
+from gknet.io.atomic import write_bytes
+from gknet.io.torch_file import load_torch_file
 
 CHECKPOINT = "checkpoint.pt"
 BEST = "best.safetensors"
 
 
 @dataclass(eq=False)
-class State:
+class TrainingState:
     """All that a run needs to go on as if it had never stopped.
 
     samples    seen so far, all processes together: the sampler's position
@@ -39,7 +39,12 @@ class State:
 
 
 def save_checkpoint(
-    folder: Path, state: State, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer, identity: str
+    folder: Path,
+    state: TrainingState,
+    network: nn.Module,
+    average: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    identity: str,
 ) -> None:
     buffer = io.BytesIO()
     content = {
@@ -57,7 +62,7 @@ def save_checkpoint(
 
 def load_checkpoint(
     folder: Path, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer, identity: str
-) -> State:
+) -> TrainingState:
     """Put a checkpoint's state into its arguments; `identity` names what must not have changed in between."""
     path = folder / CHECKPOINT
     if not path.exists():
@@ -74,7 +79,7 @@ def load_checkpoint(
         torch.set_rng_state(content["torch_rng"])
         if torch.cuda.is_available() and content["cuda_rng"]:
             torch.cuda.set_rng_state_all(content["cuda_rng"])
-        return State(**content["state"])
+        return TrainingState(**content["state"])
     except (
         AttributeError,
         KeyError,

@@ -23,17 +23,17 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from gknet.atomic import write_bytes
 from gknet.errors import GknetError
+from gknet.inference.onnx_model import METADATA_KEY
+from gknet.io.atomic import write_bytes
 from gknet.network.backbone import ConvNorm
 from gknet.network.build import Network, build
 from gknet.network.dmanet import DMANet
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.network.locator import Locator
-from gknet.onnx_network import METADATA_KEY
 from gknet.spacecraft import spacecraft_from_toml
 from gknet.training.checkpoint import BEST, load_weights, save_weights
-from gknet.training.settings import Run, load_run
+from gknet.training.settings import TrainingRun, load_run
 
 TOLERANCE = 1e-3
 """Largest difference between torch and onnxruntime: of a heatmap (its peak is 1), of a belief, of a crop's side."""
@@ -91,7 +91,7 @@ class Answer(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 3 s s"]) -> tuple[Tensor, ...]:
         network = self.network
-        return network.seen(image) if isinstance(network, HeatmapNetwork) else (network(image),)
+        return network.predict(image) if isinstance(network, HeatmapNetwork) else (network(image),)
 
 
 def onnx_graph(network: Network, example: Float[Tensor, "b 3 s s"]) -> onnx.ModelProto:
@@ -185,7 +185,7 @@ def shape_of_output(network: Network) -> dict[str, object]:
     return {"kind": "keypoints", "stride": network.stride, "bins": network.attitude_bins}
 
 
-def metadata(run: Run, network: Network, tolerance: float) -> dict[str, object]:
+def metadata(run: TrainingRun, network: Network, tolerance: float) -> dict[str, object]:
     """What the runtime must know to use the file."""
     best = run.best or {}
     return {

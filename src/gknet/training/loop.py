@@ -23,16 +23,16 @@ from gknet.training.batch import Loader
 from gknet.training.checkpoint import (
     BEST,
     CHECKPOINT,
-    State,
+    TrainingState,
     load_checkpoint,
     save_checkpoint,
     save_weights,
     warm_start,
 )
+from gknet.training.metric_logger import MetricLogger
 from gknet.training.optimizer import make_optimizer
-from gknet.training.progress import Teller
 from gknet.training.schedule import Budget, learning_rate, stage_at
-from gknet.training.settings import Run, TrainSettings
+from gknet.training.settings import TrainingRun, TrainSettings
 from gknet.training.setup import check_cameras, make_fabric, make_task, open_cache, update_average
 from gknet.training.validation import usable_rows, validation_rows
 
@@ -50,7 +50,7 @@ def train(
     val: Path | None = None,
     quiet: bool = False,
     on_step: Callable[[int], None] = lambda samples: None,
-) -> State:
+) -> TrainingState:
     """Train on the train split of the SKD folder `data`, validate on the val split of the folder `val`.
 
     val           `data` when None; crops to train on and whole frames to validate on are folders of their own
@@ -85,9 +85,9 @@ def train(
 
     kind = f"{settings.network} ({settings.graph}, {settings.chosen_loss})"
     identity = f"{kind}, {spacecraft.name} with {spacecraft.keypoint_count} keypoints, seed {settings.seed}"
-    state = load_checkpoint(out, network, average, optimizer, identity) if resume else State()
+    state = load_checkpoint(out, network, average, optimizer, identity) if resume else TrainingState()
     toml = spacecraft_toml(replace(spacecraft, mesh_path=None))
-    run = Run(
+    run = TrainingRun(
         settings.network,
         settings.graph,
         settings.chosen_loss,
@@ -126,7 +126,7 @@ def train(
             )
         return {f"val_{name}": value for name, value in found.values.items()}
 
-    with Teller(out, state.history, quiet or not fabric.is_global_zero) as teller, closing(batches):
+    with MetricLogger(out, state.history, quiet or not fabric.is_global_zero) as logger, closing(batches):
         progress = budget.progress(state.samples, state.elapsed_s)
         reported, saved = (state.samples, time.monotonic()), time.monotonic()
         losses: list[float] = []
@@ -151,8 +151,8 @@ def train(
                 losses.append(loss.item())
                 if not math.isfinite(losses[-1]):
                     raise DivergedError(f"train: the loss became {losses[-1]} after {state.steps} steps; lower --lr")
-                looking = math.floor(progress * settings.validations) > math.floor(before * settings.validations)
-                if looking or state.steps % REPORT_STEPS == 0:
+                validating = math.floor(progress * settings.validations) > math.floor(before * settings.validations)
+                if validating or state.steps % REPORT_STEPS == 0:
                     row = {
                         "progress": progress,
                         "elapsed_s": state.elapsed_s,
@@ -162,14 +162,14 @@ def train(
                         "loss": sum(losses) / len(losses),
                         "images_per_s": (state.samples - reported[0]) / max(1e-9, now - reported[1]),
                     }
-                    if looking:
+                    if validating:
                         row |= validate()
                         fabric.barrier()
                         state.elapsed_s = time.monotonic() - started
-                    teller.tell(row, state.elapsed_s / max(progress, 1e-9) * (1 - progress))
+                    logger.log(row, state.elapsed_s / max(progress, 1e-9) * (1 - progress))
                     reported, losses = (state.samples, time.monotonic()), []
                 on_step(state.samples)
-                if looking or time.monotonic() - saved > CHECKPOINT_S:
+                if validating or time.monotonic() - saved > CHECKPOINT_S:
                     save()
                     saved = time.monotonic()
         except KeyboardInterrupt:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gknet.network.dmanet import Branches
-from gknet.network.heatmap import log_belief
+from gknet.network.heatmap import log_probability
 
 TINY = 1e-12
 
@@ -54,12 +54,12 @@ def likelihood_loss(
     """
     wanted = targets.flatten(2)
     wanted = wanted / wanted.sum(dim=2, keepdim=True).clamp(min=TINY)
-    divergence = (wanted * (wanted.clamp(min=TINY).log() - log_belief(maps))).sum(dim=2)
+    divergence = (wanted * (wanted.clamp(min=TINY).log() - log_probability(maps))).sum(dim=2)
     return (divergence * weight).sum() / weight.sum().clamp(min=1)
 
 
 def attitude_loss(
-    attitude: Float[Tensor, "b k"], label: Float[Tensor, "b k"], weight: Float[Tensor, "b"]
+    attitude: Float[Tensor, "b k"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
 ) -> Float[Tensor, ""]:
     """Divergence of the belief in the attitude's classes from the soft label, averaged where `weight` is 1. 0 at best.
 
@@ -70,7 +70,7 @@ def attitude_loss(
 
 
 def direct_loss(
-    branches: Branches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, "b"]
+    branches: Branches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
 ) -> Float[Tensor, ""]:
     """Smooth L1 of the offset and of log_depth, and the divergence of the attitude's belief from its soft label.
 

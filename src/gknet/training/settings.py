@@ -9,8 +9,8 @@ from typing import Annotated
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gknet.atomic import write_text
 from gknet.errors import GknetError
+from gknet.io.atomic import write_text
 from gknet.network.build import GRAPH_NETWORKS, NETWORKS, OWN_LOSS_NETWORKS, default_loss
 from gknet.network.graph import checked_graph
 from gknet.network.heatmap import checked_loss
@@ -110,7 +110,7 @@ class TrainSettings:
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """run.json: what `gknet export` and a resumed run need to know.
 
     spacecraft_toml  the text of the spacecraft's file
@@ -132,7 +132,7 @@ class Run:
         write_text(folder / "run.json", json.dumps(asdict(self), indent=1, default=str) + "\n")
 
 
-def load_run(folder: Path) -> Run:
+def load_run(folder: Path) -> TrainingRun:
     path = folder / "run.json"
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -142,11 +142,11 @@ def load_run(folder: Path) -> Run:
         ) from error
     except ValueError as error:
         raise GknetError(f"{path}: not valid JSON: {error}") from error
-    names = {field.name for field in fields(Run)}
+    names = {field.name for field in fields(TrainingRun)}
     if not isinstance(values, dict) or set(values) != names:
         raise GknetError(f"{path}: expected the keys {', '.join(sorted(names))}")
     try:
-        return TypeAdapter(Run).validate_python(values)
+        return TypeAdapter(TrainingRun).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
         raise GknetError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -9,10 +9,10 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from gknet.attitude import AttitudeBins
 from gknet.dataset.skd import SkdDataset
-from gknet.direct import has_square_pixels
 from gknet.errors import GknetError
+from gknet.inference.attitude import AttitudeBins
+from gknet.inference.direct_estimator import has_square_pixels
 from gknet.network.build import Network
 from gknet.network.dmanet import DMANet
 from gknet.network.locator import Locator
@@ -109,7 +109,7 @@ def _stamp(data: SkdDataset, row: int) -> str:
 
 def open_cache(data: SkdDataset, settings: TrainSettings, folder: Path, say: Callable[[str], None]) -> Cache:
     """The decoded crops of `data`, built under `folder` if they are not there."""
-    from gknet.progress import progress
+    from gknet.io.progress import progress
 
     stamp = " ".join(_stamp(data, row) for row in validation_rows(len(data), STAMPED))
     size = PICTURE_SIZE if settings.window == "picture" else settings.cache_size

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gknet.attitude import AttitudeBins
 from gknet.frame import Frame
+from gknet.inference.attitude import AttitudeBins
 from gknet.network.dmanet import DMANet
 from gknet.network.gknet import GKNet
-from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork, Hints
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork, KeypointPrompts
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
 from gknet.training.loss import (
@@ -49,7 +49,7 @@ class Task(Protocol):
 
 def labelled(
     batch: Batch, bins: AttitudeBins, device: torch.device
-) -> tuple[Float[Tensor, "b 7"], Float[Tensor, "b k"], Float[Tensor, "b"]]:
+) -> tuple[Float[Tensor, "b 7"], Float[Tensor, "b k"], Float[Tensor, " b"]]:
     """Poses, soft labels of their attitudes, and 1 where there is a pose; 0 where there is none."""
     known = batch.pose.isfinite().all(dim=1)
     pose = torch.where(known[:, None], batch.pose, 0.0)
@@ -79,9 +79,9 @@ class KeypointTask:
         points, weight = batch.points_px.to(device), batch.weight.to(device)
         targets = gaussian_targets(points, keypoint_network.stride, height, width, SIGMA_CELLS)
         loss = torch.zeros((), device=device)
-        if keypoint_network.looks_twice:
+        if keypoint_network.two_pass:
             told = batch.told.to(device)
-            branches = cast(GKNet, network).branches(image, Hints(targets, told))
+            branches = cast(GKNet, network).branches(image, KeypointPrompts(targets, told))
             loss = loss + FIRST_LOOK * measure(cast(Tensor, branches.first), targets, weight)
             weight = weight * ~told
         else:

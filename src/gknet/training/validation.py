@@ -11,15 +11,15 @@ from jaxtyping import Float32
 from numpy import ndarray
 from torch import nn
 
-from gknet import metrics
-from gknet.attitude import AttitudeBins
-from gknet.calibration import BARE, calibrated, sight
-from gknet.decode import Decoding
-from gknet.direct import DirectEstimator
 from gknet.errors import GknetError
-from gknet.estimator import Estimator
+from gknet.evaluation import metrics
+from gknet.evaluation.calibration import UNCALIBRATED, calibrated, collect_sample
 from gknet.frame import Frame
-from gknet.locate import Looking, Seen
+from gknet.inference.attitude import AttitudeBins
+from gknet.inference.decode import Decoding
+from gknet.inference.direct_estimator import DirectEstimator
+from gknet.inference.estimator import Estimator
+from gknet.inference.locate import InferenceSettings, NetworkOutput
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 
@@ -83,15 +83,15 @@ def validate_keypoints(
 ) -> Validation:
     """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
     network.eval()
-    looking = Looking(input_size=input_size)
+    settings = InferenceSettings(input_size=input_size)
     run = numpy_network(network, device)
-    bare = Estimator(lambda images: Seen(run(images)), spacecraft, looking=looking, decoding=BARE)
-    sights = [sight(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
+    bare = Estimator(lambda images: NetworkOutput(run(images)), spacecraft, settings=settings, decoding=UNCALIBRATED)
+    samples = [collect_sample(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
     try:
-        estimator = calibrated(bare, sights)
+        estimator = calibrated(bare, samples)
     except GknetError:  # nothing was sure enough yet
         estimator = replace(bare, decoding=Decoding())
-    errors = [metrics.errors(s.frame, s.estimate(estimator), spacecraft) for s in sights]
+    errors = [metrics.compute_errors(s.frame, s.estimate(estimator), spacecraft) for s in samples]
     values = _means(errors) | {
         "floor_cells": estimator.decoding.floor_cells,
         "spread_scale": estimator.decoding.spread_scale,
@@ -122,13 +122,13 @@ def validate_direct(
 ) -> Validation:
     """The oracle crop's errors; the score is that of the keypoint networks, of the points where the pose puts them."""
     network.eval()
-    looking = Looking(input_size=input_size)
-    estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, looking=looking)
+    settings = InferenceSettings(input_size=input_size)
+    estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, settings=settings)
     errors = []
     for _, frame in _usable(frames, rows, spacecraft, print):
         assert frame.image is not None
         estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(spacecraft.points_m))
-        errors.append(metrics.errors(frame, estimate, spacecraft))
+        errors.append(metrics.compute_errors(frame, estimate, spacecraft))
     values = _means(errors)
     return Validation(values["rmse_px"], values)
 
@@ -145,7 +145,10 @@ def validate_locator(
     network.eval()
     run = numpy_network(network, device)
     estimator = Estimator(
-        lambda images: Seen(run(images)), spacecraft, locator=run, looking=Looking(locator_size=input_size)
+        lambda images: NetworkOutput(run(images)),
+        spacecraft,
+        locator=run,
+        settings=InferenceSettings(locator_size=input_size),
     )
     overlaps = []
     for _, frame in _usable(frames, rows, spacecraft, print):

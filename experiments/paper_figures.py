@@ -1,0 +1,149 @@
+"""Figure 2 of the paper (the keypoints of the spacecraft, and the dataset), figure 3 (detections by method), and
+the README's picture (estimates of the shipped models).
+
+    python experiments/paper_figures.py --out docs/images
+    python experiments/paper_figures.py --out docs/images --work runs/paper --scale cpu     # figure 3 too
+
+Hardware   any
+Time       seconds
+Expected   keypoints.jpg and overlays.jpg from the bundled frames; detections.jpg from the models of
+           paper_tables.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy import ndarray
+
+from gknet.cli.demo import bundled_frames
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError, ends_in_one_line
+from gknet.evaluation.metrics import compute_errors, oracle_crop
+from gknet.fleet import NAMES
+from gknet.frame import Estimate, Frame
+from gknet.inference.estimator import load_estimator
+from gknet.io.atomic import write_bytes
+from gknet.report.canvas import Canvas
+from gknet.report.overlay import draw_overlay, zoomed
+from gknet.report.palette import SKY, WHITE
+from gknet.spacecraft import Spacecraft
+
+SIDE = 512
+METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
+FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
+
+
+def craft_close(frame: Frame, spacecraft: Spacecraft) -> Frame:
+    """The frame in its oracle crop."""
+    near, _ = zoomed(frame, Estimate(failure="only looked at"), oracle_crop(frame, spacecraft, SIDE))
+    return near
+
+
+def definition(frame: Frame, spacecraft: Spacecraft) -> ndarray:
+    """The true skeleton with a number at each keypoint."""
+    near = craft_close(frame, spacecraft)
+    canvas = Canvas(near.image.copy())
+    pixels = near.keypoints_px(spacecraft.points_m)
+    for i, j in spacecraft.edges:
+        canvas.line(pixels[i], pixels[j], SKY, 1.5)
+    for k, pixel in enumerate(pixels):
+        canvas.disc(pixel, SKY)
+        away = pixel - pixels.mean(axis=0)
+        canvas.label(str(k + 1), pixel + 26 * away / max(np.linalg.norm(away), 1e-9), WHITE, 26)
+    canvas.text(spacecraft.name, np.array([20.0, 40.0]), WHITE, 30)
+    return canvas.image
+
+
+def sheet(rows: list[list[ndarray]], gap: int = 8) -> ndarray:
+    """Pictures of one size in rows, white between them."""
+    edged = [[np.pad(picture, ((0, gap), (0, gap), (0, 0)), constant_values=255) for picture in row] for row in rows]
+    return np.concatenate([np.concatenate(row, axis=1) for row in edged])
+
+
+def write_jpeg(path: Path, image: ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+    print(f"wrote {path}")
+
+
+def keypoint_figure() -> ndarray:
+    """A row of definitions and two rows of whole frames."""
+    rows: list[list[ndarray]] = [[], [], []]
+    for name in NAMES:
+        dataset = SkdDataset(bundled_frames(), None, name)
+        frames = [dataset.frame(i) for i in range(len(dataset))]
+        # the frame in which most keypoints are seen, the larger the better
+        best = max(frames, key=lambda f: (f.visible.sum(), -np.linalg.norm(f.cam_from_body.translation_m)))
+        rows[0].append(definition(best, dataset.spacecraft))
+        for row, frame in zip(rows[1:], (frames[0], frames[-1]), strict=True):
+            row.append(cv2.resize(frame.image, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
+    return sheet(rows)
+
+
+def overlay_figure(place: int = 4) -> ndarray:
+    """The frame at one place of each bundled sequence, with the estimate from the full image and the truth."""
+    row = []
+    for name in NAMES:
+        dataset = SkdDataset(bundled_frames(), None, name)
+        frame = dataset.frame(place)
+        estimate = load_estimator(name).estimate(frame.image, frame.camera)
+        near, close = zoomed(frame, estimate, oracle_crop(frame, dataset.spacecraft, SIDE))
+        drawn = draw_overlay(near, dataset.spacecraft, close, [name], legend=False, weight=1.3)
+        row.append(cv2.resize(drawn, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
+    return sheet([row])
+
+
+def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequence[str], seed: int = 0) -> ndarray:
+    """A row for each spacecraft, a column for each method: the frame of median difficulty for all of them together."""
+    rows = []
+    for name in spacecraft_names:
+        estimators = {}
+        for method, key in methods.items():
+            folder = work / "models" / f"{name}_{key}_{seed}"
+            if not (folder / "keypoints.onnx").is_file():
+                raise GknetError(f"{folder}: no model; run experiments/paper_tables.py for it first")
+            estimators[method] = load_estimator(folder)
+        dataset = SkdDataset(work / "frames", "test", name)
+        spacecraft = dataset.spacecraft
+        places = range(0, len(dataset), max(1, len(dataset) // 40))
+        found = []
+        for place in places:
+            frame = dataset.frame(place)
+            box = frame.true_box(spacecraft.points_m)
+            estimates = {m: e.estimate(frame.image, frame.camera, box) for m, e in estimators.items()}
+            rmse = {m: compute_errors(frame, estimate, spacecraft).rmse_px for m, estimate in estimates.items()}
+            found.append((float(np.mean(list(rmse.values()))), frame, estimates, rmse))
+        found.sort(key=lambda item: item[0])
+        _, frame, estimates, rmse = found[len(found) // 2]
+        row = []
+        for method, estimate in estimates.items():
+            near, close = zoomed(frame, estimate, oracle_crop(frame, spacecraft, SIDE))
+            words = [method, f"RMSE {rmse[method]:.1f} px"]
+            row.append(draw_overlay(near, spacecraft, close, words, legend=False, weight=1.3))
+        rows.append(row)
+    return sheet(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
+    parser.add_argument("--work", type=Path, help="work folder of experiments/paper_tables.py")
+    parser.add_argument("--scale", default="cpu", help="its sub-folder")
+    parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES), help="the rows of figure 3")
+    arguments = parser.parse_args()
+    write_jpeg(arguments.out / "keypoints.jpg", keypoint_figure())
+    write_jpeg(arguments.out / "overlays.jpg", overlay_figure())
+    if arguments.work is not None:
+        methods = FULL_METHODS if arguments.scale == "full" else METHODS
+        picture = detection_figure(arguments.work / arguments.scale, methods, arguments.spacecraft)
+        write_jpeg(arguments.out / "detections.jpg", picture)
+
+
+if __name__ == "__main__":
+    with ends_in_one_line():
+        main()

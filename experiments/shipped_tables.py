@@ -1,0 +1,167 @@
+"""The model cards and the README's table, from the figures that experiments/shipped_models.py left.
+
+    python experiments/shipped_tables.py --models src/gknet/models --results results/shipped_models
+
+Hardware   any
+Time       a second
+Expected   a README.md beside each model, and the tables on the terminal
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+
+from gknet.errors import GknetError, ends_in_one_line
+from gknet.fleet import NAMES
+from gknet.inference.onnx_model import METADATA_KEY
+from gknet.io.atomic import write_text
+
+PROTOCOLS = {
+    "oracle crop": ("oracle", ""),
+    "detected crop": ("detected", ""),
+    "detected crop, 4 turns": ("detected", "_tta4"),
+}
+"""Column -> the run's name in a file of figures, and the end of the file's name."""
+COLUMNS = {
+    "rmse_px": "RMSE px",
+    "rmse_hidden_px": "RMSE hidden px",
+    "pck_5": "PCK 5 px",
+    "e_t": "E_t",
+    "e_q_rad": "E_q rad",
+    "speed_score": "SPEED score",
+    "add": "ADD, diameters",
+}
+
+
+def figures(results: Path, name: str, recipe: str, words: str = "oracle crop") -> dict[str, Any]:
+    """A run of a spacecraft's metrics.json."""
+    protocol, ending = PROTOCOLS[words]
+    path = results / f"{name}_{recipe}{ending}.json"
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["runs"][protocol]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GknetError(f"{path}: not the figures of experiments/shipped_models.py ({error})") from error
+
+
+def statistic(run: dict[str, Any], name: str) -> str:
+    """Mean [95 % interval], median."""
+    found = run["metrics"].get(name)
+    if found is None:
+        return ""
+    return f"{found['mean']:.3g} [{found['low']:.3g}, {found['high']:.3g}], {found['median']:.3g}"
+
+
+def table(results: Path, recipe: str) -> str:
+    """Markdown: mean, median of the headline figures; a row for each spacecraft and crop."""
+    shown = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
+    lines = [
+        "| spacecraft, crop | frames | no pose | "
+        + " | ".join(COLUMNS[name] for name in shown)
+        + " | in 95 % | IoU >= 0.7 |",
+        "|---" * (len(shown) + 5) + "|",
+    ]
+    for name in NAMES:
+        for words in PROTOCOLS:
+            run = figures(results, name, recipe, words)
+            located = "" if words == "oracle crop" else f"{100 * run['located_07']:.1f} %"
+            pairs = [(run["metrics"][column]["mean"], run["metrics"][column]["median"]) for column in shown]
+            cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
+            cells += [f"{mean:.3g}, {median:.3g}" for mean, median in pairs]
+            lines.append("| " + " | ".join([*cells, f"{100 * run['coverage_95']:.0f} %", located]) + " |")
+    return "\n".join(lines)
+
+
+def binned_table(results: Path, recipe: str, words: str, by: str, metric: str, columns: dict[float, str]) -> str:
+    """Markdown: mean, median of a metric in the bins by a condition; `columns` are their lower ends and names."""
+    header = [f"spacecraft, {words}", *[f"{column}, frames: {COLUMNS[metric]}" for column in columns.values()]]
+    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
+    for name in NAMES:
+        bins = {b["low"]: b for b in figures(results, name, recipe, words)["bins"] if b["by"] == by}
+        cells = [name]
+        for low in columns:
+            found = bins[low]["metrics"][metric] if low in bins else None
+            cells.append("none" if found is None else f"{found['frames']}: {found['mean']:.3g}, {found['median']:.3g}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def background_table(results: Path, recipe: str) -> str:
+    """RMSE of the oracle crop, by what is behind the spacecraft."""
+    columns = {0.0: "black sky", 0.5: "Earth in view"}
+    return binned_table(results, recipe, "oracle crop", "earth_in_view", "rmse_px", columns)
+
+
+def belief_table(results: Path, recipe: str) -> str:
+    """E_q of the detected crop, by the belief in the attitude."""
+    columns = {0.0: "belief below .5", 0.5: ".5 to .8", 0.8: ".8 to .95", 0.95: "above"}
+    return binned_table(results, recipe, "detected crop", "attitude_confidence", "e_q_rad", columns)
+
+
+def validated(path: Path) -> dict[str, Any]:
+    """What the export wrote about a model, its validation included."""
+    try:
+        session = onnxruntime.InferenceSession(str(path))
+        about = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+    except Exception as error:  # onnxruntime's exceptions have no common base
+        raise GknetError(f"{path}: not a model that 'gknet export' wrote ({error})") from error
+    return about
+
+
+def card(models: Path, results: Path, name: str) -> str:
+    """What is known of one spacecraft's two networks."""
+    lines = [f"# gknet models of {name}", ""]
+    lines += [
+        "Trained on rendered pictures alone (recipe `skd`, 4,500 sequences, seed 0) by",
+        "`experiments/shipped_models.py`; the documentation says how. Keypoint errors in pixels of the 256 crop.",
+        "",
+    ]
+    lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
+    for kind in ("keypoints", "locator"):
+        path = models / name / f"{kind}.onnx"
+        about = validated(path)
+        best = ", ".join(f"{key} {value:.3g}" for key, value in about["validation"].items())
+        size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
+        lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
+    for recipe in ("skd", "skd-hard"):
+        runs = [figures(results, name, recipe, words) for words in PROTOCOLS]
+        lines += ["", f"## {recipe}, test sequences: mean [95 % interval over sequences], median", ""]
+        lines += ["| | " + " | ".join(PROTOCOLS) + " |", "|---" * (1 + len(PROTOCOLS)) + "|"]
+        for column, words in COLUMNS.items():
+            cells = [statistic(run, column) for run in runs]
+            lines.append(f"| {words} | " + " | ".join(cells) + " |")
+        covered = [f"{100 * run['coverage_95']:.0f} %" for run in runs]
+        lines.append("| true poses in the 95 % ellipsoid | " + " | ".join(covered) + " |")
+    lines += [
+        "",
+        "## Limits",
+        "",
+        "Never shown a real photograph. Made for spans of 8 to 90 % of a 1024 px frame; another camera works through",
+        "its matrix, a span far outside that does not. A frame in which symmetric parts look the same can give a wrong",
+        "attitude with a small reprojection error; attitude_confidence shows how likely that is; the package documents",
+        "how well. Weights are stored in 16 bits.",
+        "Licence: Apache-2.0, as the package.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--models", type=Path, required=True, help="folder of the exported models")
+    parser.add_argument("--results", type=Path, required=True, help="folder of the figures")
+    arguments = parser.parse_args()
+    for name in NAMES:
+        write_text(arguments.models / name / "README.md", card(arguments.models, arguments.results, name))
+    for recipe in ("skd", "skd-hard"):
+        print(f"\n{recipe}: mean, median\n\n{table(arguments.results, recipe)}")
+        print(f"\n{recipe}, by background\n\n{background_table(arguments.results, recipe)}")
+        print(f"\n{recipe}, by the belief in the attitude\n\n{belief_table(arguments.results, recipe)}")
+
+
+if __name__ == "__main__":
+    with ends_in_one_line():
+        main()

@@ -1,0 +1,216 @@
+"""A dataset through an estimator: the errors of the oracle's crop and of the detected crop, frame by frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.evaluation.metrics import FrameErrors, Summary, compute_errors, keypoint_errors_px, oracle_crop, summarise
+from gknet.frame import Estimate, Frame, Keypoints, Unreadable
+from gknet.inference.crop import Crop
+from gknet.inference.locate import CropEstimator
+from gknet.spacecraft import Spacecraft
+
+Protocol = Literal["oracle", "detected"]
+SWAP_PX = 10.0
+"""A detection within this of another keypoint, and not of its own, is a swap."""
+
+PROTOCOL_WORDS: dict[Protocol, str] = {"oracle": "oracle crop", "detected": "detected crop"}
+
+UNKNOWN_WORDS = {
+    "visible": "which keypoints the spacecraft hides, so there are no errors of hidden ones",
+    "sun_direction": "where the sun is, so there are no phase angles",
+}
+"""What a dataset without a column leaves unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One frame's answer. `index` is its place in the dataset.
+
+    keypoint_px  (n,) distances in pixels of the 256 oracle crop, NaN for keypoints out of view
+    taken_for    (n,) the true keypoint at which each detection lies (`taken_for`)
+    visible         (n,) bool: in view and not hidden; None when unknown
+    """
+
+    index: int
+    frame_name: str
+    estimate: Estimate
+    errors: FrameErrors
+    keypoint_px: Float[ndarray, " n"]
+    taken_for: Int[ndarray, " n"]
+    visible: Bool[ndarray, " n"] | None
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ProtocolRun:
+    """All frames under one protocol."""
+
+    protocol: Protocol
+    cases: tuple[Case, ...]
+
+    @cached_property
+    def summary(self) -> Summary:
+        return summarise([case.errors for case in self.cases])
+
+    @property
+    def median_ms(self) -> float:
+        """Of one estimate: everything from the image to the pose, reading excluded."""
+        return 1000 * float(np.median([case.seconds for case in self.cases]))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """`runs` saw the same frames. `passed_over` could not be read or show no keypoint, and are in no mean."""
+
+    spacecraft: Spacecraft
+    data: str
+    runs: tuple[ProtocolRun, ...]
+    passed_over: tuple[Unreadable, ...]
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """The columns of UNKNOWN_WORDS that no frame has."""
+        cases = self.runs[0].cases
+        known = {
+            "visible": any(case.visible is not None for case in cases),
+            "sun_direction": any(case.errors.phase_angle_rad is not None for case in cases),
+        }
+        return tuple(column for column in UNKNOWN_WORDS if not known[column])
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON; lengths in metres or diameters, angles in radians, keypoints in pixels of the 256 crop."""
+        return {
+            "spacecraft": self.spacecraft.name,
+            "data": self.data,
+            "unknown": list(self.unknown),
+            "passed_over": [{"name": bad.name, "reason": bad.reason} for bad in self.passed_over],
+            "runs": {run.protocol: self._run_dict(run) for run in self.runs},
+        }
+
+    def _run_dict(self, run: ProtocolRun) -> dict[str, object]:
+        names = self.spacecraft.keypoint_names
+        keypoints = [keypoint_statistics(run, k) for k in range(len(names))]
+        return {
+            **run.summary.to_dict(),
+            "median_ms": round(run.median_ms, 3),
+            "keypoints": {name: found.to_dict() for name, found in zip(names, keypoints, strict=True)},
+        }
+
+
+@dataclass(frozen=True)
+class KeypointStatistics:
+    """Of one keypoint where it is in view, px of the 256 crop; None when it never is."""
+
+    frames: int
+    median_px: float | None
+    high_px: float | None
+    hidden_median_px: float | None
+
+    def to_dict(self) -> dict[str, object]:
+        return {
+            "frames": self.frames,
+            "median_px": self.median_px,
+            "percentile_90_px": self.high_px,
+            "hidden_median_px": self.hidden_median_px,
+        }
+
+
+def keypoint_statistics(run: ProtocolRun, k: int) -> KeypointStatistics:
+    """Median and 90th percentile of keypoint `k`'s error, and its median where the spacecraft hides it."""
+    distance = np.array([case.keypoint_px[k] for case in run.cases])
+    hidden = np.array([case.visible is not None and not case.visible[k] for case in run.cases])
+    in_view = np.isfinite(distance)
+    if not in_view.any():
+        return KeypointStatistics(0, None, None, None)
+    median, high = np.percentile(distance[in_view], (50, 90))
+    concealed = distance[in_view & hidden]
+    return KeypointStatistics(
+        int(in_view.sum()), float(median), float(high), float(np.median(concealed)) if len(concealed) else None
+    )
+
+
+def evaluate(
+    dataset: SkdDataset,
+    estimator: CropEstimator,
+    protocols: Sequence[Protocol] = ("oracle", "detected"),
+    data: str = "",
+    on_frame: Callable[[], None] = lambda: None,
+) -> Evaluation:
+    """Estimate every frame under each protocol; a frame that cannot be read is noted and passed over.
+
+    data      words for the report: where the frames come from
+    on_frame  called after each frame, for a progress bar
+    """
+    cases: dict[Protocol, list[Case]] = {protocol: [] for protocol in protocols}
+    passed_over = []
+    for i in range(len(dataset)):
+        try:
+            frame = dataset.frame(i)
+            oracle_crop(frame, estimator.spacecraft)
+        except GknetError as error:
+            passed_over.append(Unreadable(f"{dataset.sequence_of(i)}, frame {i}", str(error)))
+        else:
+            for protocol in protocols:
+                cases[protocol].append(_case(i, frame, dataset.sequence_of(i), estimator, protocol))
+        on_frame()
+    if not any(cases.values()):
+        first = f"; the first: {passed_over[0].reason}" if passed_over else ""
+        raise GknetError(f"evaluation: none of {len(dataset)} frames could be used{first}")
+    runs = tuple(ProtocolRun(protocol, tuple(cases[protocol])) for protocol in protocols)
+    return Evaluation(estimator.spacecraft, data or str(dataset.root), runs, tuple(passed_over))
+
+
+def _case(index: int, frame: Frame, sequence: str, estimator: CropEstimator, protocol: Protocol) -> Case:
+    spacecraft = estimator.spacecraft
+    if frame.image is None:
+        raise GknetError(f"frame {frame.name}: an evaluation needs its image")
+    box = frame.true_box(spacecraft.points_m) if protocol == "oracle" else None
+    start = time.perf_counter()
+    estimate = estimator.estimate(frame.image, frame.camera, box)
+    seconds = time.perf_counter() - start
+    crop = oracle_crop(frame, spacecraft)
+    true_px = frame.keypoints_px(spacecraft.points_m)
+    in_view = frame.camera.contains(true_px)
+    distance = np.where(in_view, keypoint_errors_px(estimate.keypoints, true_px, crop), np.nan)
+    found = compute_errors(frame, estimate, spacecraft, crop, sequence)
+    taken = taken_for(estimate.keypoints, true_px, in_view, crop)
+    return Case(index, frame.name, estimate, found, distance, taken, frame.visible, seconds)
+
+
+def taken_for(
+    keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], in_view: Bool[ndarray, " n"], crop: Crop
+) -> Int[ndarray, " n"]:
+    """For each keypoint in view, the true keypoint that its detection lies at; -1 for none, and out of view.
+
+    What has no peak (score 0) is no detection.
+
+    Within SWAP_PX of its own (pixels of the 256 oracle crop) it is itself; else the nearest other one within SWAP_PX.
+    """
+    count = len(true_px)
+    if keypoints is None:
+        return np.full(count, -1)
+    distance = np.linalg.norm(keypoints.pixels[:, None] - true_px[None], axis=2) * crop.scale
+    distance[:, ~in_view] = np.inf
+    own = np.arange(count)
+    taken = np.where(np.diag(distance) < SWAP_PX, own, distance.argmin(axis=1))
+    return np.where(in_view & (keypoints.score > 0) & (distance[own, taken] < SWAP_PX), taken, -1)
+
+
+def confusion(run: ProtocolRun) -> Int[ndarray, "n n"]:
+    """How often keypoint i (row) in view was detected at keypoint j: the diagonal is right, the rest are swaps."""
+    taken = np.stack([case.taken_for for case in run.cases])
+    matrix = np.zeros((taken.shape[1], taken.shape[1]), dtype=np.int64)
+    for row, column in enumerate(taken.T):
+        matrix[row] = np.bincount(column[column >= 0], minlength=len(matrix))
+    return matrix

@@ -1,0 +1,351 @@
+"""Image to pose with a network that is perfect: what is left is the error of our own geometry."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gknet.inference.estimator as estimating
+from gknet.errors import GknetError
+from gknet.evaluation.metrics import compute_errors
+from gknet.frame import Box, Frame
+from gknet.geometry import Camera, Pose
+from gknet.inference.attitude import AttitudeBins
+from gknet.inference.crop import Crop
+from gknet.inference.decode import Decoding
+from gknet.inference.direct_estimator import attitude_seen
+from gknet.inference.estimator import Estimator, load_estimator, shipped_models
+from gknet.inference.locate import InferenceSettings, NetworkOutput, check_image
+from gknet.inference.pnp import PnpResult, PnpSettings
+from gknet.spacecraft import Spacecraft, spacecraft_toml
+from tests.inference.test_decode import gaussians, locator_output
+
+POINTS = np.random.default_rng(7).uniform(-1, 1, (14, 3)) * (3, 1, 1)
+CRAFT = Spacecraft("probe", tuple(f"k{i}" for i in range(14)), POINTS, ((0, 1), (1, 2)), 6.5)
+CAMERA = Camera.from_focal(1000, 800, 640)
+
+
+class Chart:
+    """A picture whose red and green say where each pixel is, and whose blue says that it is in the picture.
+
+    Red and green rise from 0 to 1 over the square from `low` to `low + span`, dithered so that they err nowhere.
+    """
+
+    def __init__(self, camera: Camera, box: Box) -> None:
+        self.camera = camera
+        self.span = 2.6 * box.side
+        self.low = np.array(box.centre) - self.span / 2
+
+    def image(self) -> np.ndarray:
+        height, width = self.camera.height, self.camera.width
+        y, x = np.mgrid[:height, :width] + 0.5
+        level = np.clip((np.stack([x, y], axis=2) - self.low) / self.span, 0, 1) * 255
+        dithered = np.floor(level + np.random.default_rng(0).random(level.shape))
+        return np.dstack([dithered, np.full((height, width), 255)]).astype(np.uint8)
+
+    def read(self, crop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Scale and offset of the crop, from nothing but its pixels: crop = scale * image + offset, per axis."""
+        size = crop.shape[1]
+        scale, offset = np.ones(2), np.zeros(2)
+        for axis in range(2):
+            use = (crop[2] > 0.999) & (crop[axis] > 0.02) & (crop[axis] < 0.98)
+            use[:4], use[-4:], use[:, :4], use[:, -4:] = False, False, False, False
+            out = np.mgrid[:size, :size][1 - axis][use] + 0.5
+            slope, start = np.polyfit(out, crop[axis][use] * self.span + self.low[axis], 1)  # image = slope out + start
+            scale[axis], offset[axis] = 1 / slope, -start / slope
+        return scale, offset
+
+
+class PerfectNetwork:
+    """Reads from the chart where the crop lies and draws a Gaussian at each true keypoint."""
+
+    def __init__(self, true_px: np.ndarray, chart: Chart, swapped: int = 0) -> None:
+        self.true_px, self.chart, self.calls = true_px.copy(), chart, 0
+        self.true_px[:swapped] = np.roll(self.true_px[:swapped], 1, axis=0)
+
+    def truth_in(self, images: np.ndarray) -> np.ndarray:
+        """The points in pixels of the crop."""
+        self.calls += 1
+        scale, offset = self.chart.read(images[0])
+        return self.true_px * scale + offset
+
+    def __call__(self, images: np.ndarray) -> NetworkOutput:
+        return NetworkOutput(gaussians(self.truth_in(images) / 4)[None])
+
+
+class PerfectLocator(PerfectNetwork):
+    """The points are two corners of the box."""
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        (x0, y0), (x1, y1) = self.truth_in(images)
+        return locator_output((x0, y0, x1, y1))[None]
+
+
+def perfect(pose: Pose, swapped: int = 0, **settings: object) -> tuple[Estimator, Frame]:
+    blank = Frame("chart", None, CAMERA, pose)
+    box = blank.true_box(POINTS)
+    assert box is not None
+    chart = Chart(CAMERA, box)
+    network = PerfectNetwork(blank.keypoints_px(POINTS), chart, swapped)
+    locator = PerfectLocator(np.array([[box.x0, box.y0], [box.x1, box.y1]]), chart)
+    return Estimator(network, CRAFT, locator, InferenceSettings(**settings)), replace(blank, image=chart.image())
+
+
+POSES = {
+    "middle": Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0.3, -0.2, 12.0]),
+    "half turn": Pose.from_quaternion([0, 1, 0, 0], [-0.5, 0.4, 15.0]),
+    "beyond the border": Pose.from_quaternion([0.9, 0.1, -0.3, 0.2], [4.6, -1.0, 12.0]),
+    "far": Pose.from_quaternion([0.1, 0.9, -0.3, 0.2], [3.0, 2.0, 60.0]),
+    "close": Pose.from_quaternion([0.5, 0.5, -0.3, 0.1], [0.2, 0.1, 6.0]),
+}
+
+
+@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("oracle", [True, False])
+def test_image_to_pose(name: str, oracle: bool) -> None:
+    estimator, frame = perfect(POSES[name])
+    estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS) if oracle else None)
+    assert estimate.failure is None
+    found = compute_errors(frame, estimate, CRAFT)
+    assert found.e_t < 1e-3
+    assert found.e_q_rad < 3e-3
+    assert found.rmse_px is not None
+    assert found.rmse_px < 0.5  # the rounding of 8 bits, magnified where the spacecraft is far
+    assert found.locator_iou is not None
+    assert found.locator_iou > (0.999 if oracle else 0.9)
+
+
+def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
+    """A dot in the picture, and a higher peak at one cell of every view, which is another place in each of them."""
+    y, x = np.mgrid[:256, :256] + 0.5
+    dot = np.exp(-((x - 170) ** 2 + (y - 80) ** 2) / (2 * 6**2))
+    image = np.repeat((230 * dot).astype(np.uint8)[:, :, None], 3, axis=2)
+    batches = []
+
+    def network(images: np.ndarray) -> NetworkOutput:
+        batches.append(len(images))
+        maps = images[:, :1].reshape(len(images), 1, 64, 4, 64, 4).mean(axis=(3, 5))
+        maps[:, :, 5, 7] = 1
+        return NetworkOutput(np.repeat(maps, 14, axis=1).astype(np.float32))
+
+    for tta_rotations, place in ((1, (30, 22)), (2, (170, 80)), (4, (170, 80))):
+        estimator = Estimator(network, CRAFT, settings=InferenceSettings(tta_rotations=tta_rotations))
+        found, _ = estimator.detect(image, Crop(0, 0, 256, 256))
+        np.testing.assert_allclose(found.pixels, [place] * 14, atol=0.2)
+        assert found.score.min() > 0.7  # every view says so
+    assert batches == [1, 2, 4]
+
+
+def test_other_orientations_than_quarter_turns_are_refused() -> None:
+    with pytest.raises(GknetError, match="1, 2 or 4"):
+        load_estimator("satellite_01", tta_rotations=3)
+
+
+def test_a_box_that_the_keypoints_contradict_has_no_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, frame = perfect(POSES["middle"])
+    true_solve, boxes = estimating.solve_pnp, []
+
+    def solve(*arguments: object) -> PnpResult:
+        boxes.append(arguments[5])
+        return true_solve(*arguments)
+
+    monkeypatch.setattr(estimating, "solve_pnp", solve)
+    good = frame.true_box(POINTS)
+    assert good is not None
+    poor = Box(good.x0 + 0.35 * good.side, good.y0, good.x1 + 0.35 * good.side, good.y1)
+    for box in (good, poor):
+        estimator.estimate(frame.image, CAMERA, box)
+    assert boxes == [good, poor, None]
+
+
+def test_swapped_keypoints_do_not_move_the_pose() -> None:
+    estimator, frame = perfect(POSES["middle"], swapped=5)
+    estimate = estimator.estimate(frame.image, CAMERA)
+    assert estimate.inliers is not None
+    assert not estimate.inliers[:5].any()
+    assert compute_errors(frame, estimate, CRAFT).e_t < 1e-3
+
+
+def test_a_poor_box_is_mended_by_the_second_look() -> None:
+    estimator, frame = perfect(POSES["middle"])
+    true_box = frame.true_box(POINTS)
+    assert true_box is not None
+    shift = 0.35 * true_box.side
+    poor = Box(true_box.x0 + shift, true_box.y0, true_box.x1 + shift, true_box.y1)
+    estimate = estimator.estimate(frame.image, CAMERA, poor)
+    assert estimator.keypoint_network.calls == 2
+    assert estimate.keypoints is not None
+    assert estimate.box == poor
+    assert estimate.keypoints.score.min() > 0.9
+    once, _ = perfect(POSES["middle"], refine_crop=False)
+    first = once.estimate(frame.image, CAMERA, poor)
+    assert once.keypoint_network.calls == 1
+    assert first.keypoints is not None
+    assert first.keypoints.score.min() < 0.9
+
+
+def test_a_box_far_larger_than_the_image_is_cut_to_it() -> None:
+    estimator, frame = perfect(POSES["close"])
+    estimate = estimator.estimate(frame.image, CAMERA, Box(-1e9, -1e9, 1e9, 1e9))
+    assert estimate.box == Box(0.0, 0.0, float(CAMERA.width), float(CAMERA.height))
+    assert estimate.failure is None
+
+
+def test_a_good_box_needs_one_look() -> None:
+    estimator, frame = perfect(POSES["middle"])
+    estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    assert estimator.keypoint_network.calls == 1
+
+
+def test_same_image_same_estimate() -> None:
+    estimator, frame = perfect(POSES["middle"])
+    first, second = (estimator.estimate(frame.image, CAMERA) for _ in range(2))
+    assert np.array_equal(first.covariance, second.covariance)
+
+
+def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
+    """Of a twin's attitude, half a turn away about the line of sight, it is told to doubt the pose."""
+    bins, pose = AttitudeBins(12), POSES["beyond the border"]
+    estimator, frame = perfect(pose)
+    box = frame.true_box(POINTS)
+    see = estimator.keypoint_network
+    assert estimator.estimate(frame.image, CAMERA, box).attitude_confidence is None
+    twin = pose @ Pose.from_rotation_vector([0, 0, math.pi], [0, 0, 0])
+    for believed, low, high in ((pose, 0.95, 1.0), (twin, 0.0, 0.05)):
+        label = bins.soft_label(attitude_seen(believed))[None].astype(np.float32)
+        sure = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=label), bins=bins)  # noqa: B023
+        estimate = sure.estimate(frame.image, CAMERA, box)
+        assert estimate.cam_from_body is not None
+        assert estimate.cam_from_body.angle_to(pose) < 0.01
+        assert estimate.attitude_confidence is not None
+        assert low <= estimate.attitude_confidence <= high
+
+
+def test_failures_are_values_with_reasons() -> None:
+    estimator, frame = perfect(POSES["middle"])
+    assert estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50)).failure == "the box lies outside the image"
+    blind = Estimator(lambda images: NetworkOutput(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
+    estimate = blind.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    assert estimate.failure is not None
+    assert "0 keypoints" in estimate.failure
+    assert estimate.keypoints is not None
+    lost = Estimator(estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32))
+    assert lost.estimate(frame.image, CAMERA).failure == "the locator sees no spacecraft"
+
+
+@pytest.mark.parametrize("range_factor", [0.02, 100.0])
+def test_a_pose_of_another_size_than_the_crop_is_refused(range_factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, frame = perfect(POSES["middle"])
+    true_solve = estimating.solve_pnp
+
+    def solve(*arguments: object) -> PnpResult:
+        result = true_solve(*arguments)
+        pose = result.cam_from_body
+        return replace(result, cam_from_body=Pose(pose.rotation, pose.translation_m * range_factor))
+
+    monkeypatch.setattr(estimating, "solve_pnp", solve)
+    estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    assert estimate.cam_from_body is None
+    assert "crops large" in str(estimate.failure)
+
+
+def test_thresholds_are_in_pixels_of_the_input() -> None:
+    """A large crop is seen coarsely: 2 px in the input are many in the image, and still no outliers."""
+    estimator, frame = perfect(POSES["close"])
+    network = estimator.keypoint_network
+    jitter = np.random.default_rng(1).normal(0, 2.0, POINTS.shape[:1] + (2,))
+
+    def jittered(images: np.ndarray) -> NetworkOutput:
+        return NetworkOutput(gaussians((network.truth_in(images) + jitter) / 4)[None])
+
+    strict = PnpSettings(threshold_px=(6.0,), min_inlier_fraction=0.9)
+    estimate = Estimator(jittered, CRAFT, pnp=strict).estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    assert estimate.failure is None
+    assert estimate.reprojection_rms_px is not None
+    assert estimate.reprojection_rms_px > 3
+
+
+def test_the_locator_sees_the_whole_frame_in_the_middle() -> None:
+    views = []
+
+    def locator(images: np.ndarray) -> np.ndarray:
+        views.append(images[0])
+        return np.zeros((1, 5, 64, 64), dtype=np.float32)
+
+    image = np.full((100, 200, 3), 255, dtype=np.uint8)
+    assert Estimator(NetworkOutput, CRAFT, locator).locate(image) is None
+    lit = views[0][0] > 0.5
+    assert lit[64:192].all()
+    assert not lit[:64].any()
+    assert not lit[192:].any()
+
+
+def test_grey_is_read_as_rgb() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (20, 30), dtype=np.uint8)
+    assert (check_image(grey) == grey[:, :, None]).all()
+    assert check_image(grey).shape == (20, 30, 3)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((20, 30, 4), dtype=np.uint8),
+        np.zeros((20, 30, 3), dtype=np.float32),
+        np.zeros((0, 30, 3), dtype=np.uint8),
+        np.zeros(5, dtype=np.uint8),
+        None,
+    ],
+)
+def test_other_images_are_refused(image: object) -> None:
+    with pytest.raises(GknetError, match="image"):
+        check_image(image)
+
+
+def test_bad_use_is_refused() -> None:
+    estimator, frame = perfect(POSES["middle"])
+    with pytest.raises(GknetError, match="800 x 640"):
+        estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
+    with pytest.raises(GknetError, match="give a box"):
+        Estimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
+    see = estimator.keypoint_network
+    few = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=np.ones((1, 4), np.float32)))
+    with pytest.raises(GknetError, match="864 classes of attitude, got 4"):
+        replace(few, bins=AttitudeBins(12)).estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    wrong = Estimator(lambda images: NetworkOutput(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
+    with pytest.raises(GknetError, match="14 heatmaps"):
+        wrong.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+
+
+def test_load_from_a_folder(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    from tests.inference.test_onnx_model import METADATA, write_pool
+
+    keypoints = METADATA | {
+        "input_size": 32,
+        "floor_cells": 0.4,
+        "spread_scale": 2.0,
+        "pose_scale": 1.5,
+        "spacecraft": spacecraft_toml(CRAFT),
+    }
+    write_pool(tmp_path / "keypoints.onnx", json.dumps(keypoints), size=32)
+    estimator = load_estimator(tmp_path, threads=1)
+    assert estimator.locator is None
+    assert estimator.spacecraft.name == "probe"
+    assert estimator.settings.input_size == 32
+    assert estimator.decoding == Decoding(floor_cells=0.4, spread_scale=2.0)
+    assert estimator.pnp.covariance_scale == 1.5
+    write_pool(tmp_path / "locator.onnx", json.dumps(keypoints), size=32)
+    with pytest.raises(GknetError, match="kind 'locator'"):
+        load_estimator(tmp_path)
+
+
+def test_unknown_model_lists_what_exists(tmp_path: Path) -> None:
+    with pytest.raises(GknetError, match="shipped model") as caught:
+        load_estimator(tmp_path / "none")
+    for name in shipped_models():
+        assert name in str(caught.value)
