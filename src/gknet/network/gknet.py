@@ -158,7 +158,7 @@ class GKNet(HeatmapNetwork):
     def _votes(
         self, attitude: Float[Tensor, "b k"] | None, convinced: Float[Tensor, "b n hw"], height: int, width: int
     ) -> Float[Tensor, "b to from p"] | None:
-        """The codes of where each keypoint must be by what the others are convinced of (decision 0017)."""
+        """The codes of where each keypoint must be by what the others are convinced of (decision 0016)."""
         if attitude is None:
             return None
         found = convinced.float() @ cell_centres(height, width, convinced).flatten(0, 1)
@@ -174,7 +174,7 @@ class GKNet(HeatmapNetwork):
 
         Each node is a 1x1 filter over these pixels: it says where its keypoint is. Between the layers of the decoder it
         sees what is where it believes its keypoint to be (decision 0012); in the second look, where the first one put
-        it, and so do its neighbours by its messages (decision 0013).
+        it, and so do its neighbours by its messages (decision 0012).
         """
         code = position_encoding(up.shape[2], up.shape[3], up)
         along = self.pixel_position(code.flatten(1).T).T.reshape(-1, *up.shape[2:])

@@ -73,7 +73,7 @@ class EdgeConvolution(nn.Module):
     """Messages along the edges that know both of their ends (EdgeConv, Wang et al. 2019), summed as A~ weighs them.
 
     Under eq. 2 a node tells all its neighbours the same; here it can tell each where that one must be. `votes` are the
-    codes of such places (decision 0017), of POSITION_WIDTH; a decoder without them says nothing of places.
+    codes of such places (decision 0016), of POSITION_WIDTH; a decoder without them says nothing of places.
     """
 
     adjacency: Tensor
