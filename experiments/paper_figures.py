@@ -1,12 +1,12 @@
 """Figure 2 of the paper (the keypoints of the spacecraft, and the dataset), figure 3 (detections by method), and
-the README's picture (estimates of the shipped models).
+the README's moving picture (estimates of the shipped models).
 
     python experiments/paper_figures.py --out docs/images
     python experiments/paper_figures.py --out docs/images --work runs/paper --scale cpu     # figure 3 too
 
 Hardware   any
 Time       seconds
-Expected   keypoints.jpg and overlays.jpg from the bundled frames; detections.jpg from the models of
+Expected   keypoints.jpg and overlays.webp from the bundled frames; detections.jpg from the models of
            paper_tables.py
 """
 
@@ -33,7 +33,7 @@ from gknet.report.overlay import draw_overlay, zoomed
 from gknet.report.palette import SKY, WHITE
 from gknet.spacecraft import Spacecraft
 
-SIDE = 512
+SIDE, MOVING_SIDE = 512, 320
 METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
 FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
@@ -85,17 +85,32 @@ def keypoint_figure() -> ndarray:
     return sheet(rows)
 
 
-def overlay_figure(place: int = 4) -> ndarray:
-    """The frame at one place of each bundled sequence, with the estimate from the full image and the truth."""
-    row = []
+def overlay_figures() -> list[ndarray]:
+    """A row for each frame of the bundled sequences: the estimates from the full image and the truth."""
+    columns = []
     for name in NAMES:
-        dataset = SkdDataset(bundled_frames(), None, name)
-        frame = dataset.frame(place)
-        estimate = load_estimator(name).estimate(frame.image, frame.camera)
-        near, close = zoomed(frame, estimate, oracle_crop(frame, dataset.spacecraft, SIDE))
-        drawn = draw_overlay(near, dataset.spacecraft, close, [name], legend=False, weight=1.3)
-        row.append(cv2.resize(drawn, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
-    return sheet([row])
+        dataset, estimator = SkdDataset(bundled_frames(), None, name), load_estimator(name)
+        column = []
+        for frame in dataset:
+            estimate = estimator.estimate(frame.image, frame.camera)
+            near, close = zoomed(frame, estimate, oracle_crop(frame, dataset.spacecraft, SIDE))
+            drawn = draw_overlay(near, dataset.spacecraft, close, [name], legend=False, weight=1.3)
+            column.append(cv2.resize(drawn, (MOVING_SIDE, MOVING_SIDE), interpolation=cv2.INTER_AREA))
+        columns.append(column)
+    return [np.concatenate(row, axis=1) for row in zip(*columns, strict=True)]
+
+
+def write_moving(path: Path, pictures: list[ndarray], fps: float = 4.0) -> None:
+    """An animated WebP that plays forward and back, without end."""
+    there_and_back = [*pictures, *pictures[-2:0:-1]]
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(picture[:, :, ::-1]) for picture in there_and_back]
+    animation.durations = np.full(len(there_and_back), round(1000 / fps), dtype=np.int32)
+    found, data = cv2.imencodeanimation(".webp", animation, [cv2.IMWRITE_WEBP_QUALITY, 70])
+    if not found:
+        raise GknetError(f"{path}: this OpenCV cannot write an animated WebP")
+    write_bytes(path, data.tobytes())
+    print(f"wrote {path}")
 
 
 def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequence[str], seed: int = 0) -> ndarray:
@@ -137,7 +152,7 @@ def main() -> None:
     parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES), help="the rows of figure 3")
     arguments = parser.parse_args()
     write_jpeg(arguments.out / "keypoints.jpg", keypoint_figure())
-    write_jpeg(arguments.out / "overlays.jpg", overlay_figure())
+    write_moving(arguments.out / "overlays.webp", overlay_figures())
     if arguments.work is not None:
         methods = FULL_METHODS if arguments.scale == "full" else METHODS
         picture = detection_figure(arguments.work / arguments.scale, methods, arguments.spacecraft)
