@@ -25,7 +25,7 @@ from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError, ends_in_one_line
 from gknet.evaluation.metrics import compute_errors, oracle_crop
 from gknet.fleet import NAMES
-from gknet.frame import Estimate, Frame
+from gknet.frame import Estimate, Failure, FailureKind, Frame
 from gknet.inference.estimator import load_estimator
 from gknet.io.atomic import write_bytes
 from gknet.report.canvas import Canvas
@@ -40,7 +40,9 @@ FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
 def craft_close(frame: Frame, spacecraft: Spacecraft) -> Frame:
     """The frame in its oracle crop."""
-    near, _ = zoomed(frame, Estimate(failure="only looked at"), oracle_crop(frame, spacecraft, SIDE))
+    near, _ = zoomed(
+        frame, Estimate(failure=Failure(FailureKind.NO_SOLUTION, "not estimated")), oracle_crop(frame, spacecraft, SIDE)
+    )
     return near
 
 

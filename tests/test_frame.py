@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Estimate, Frame
+from gknet.frame import Box, Estimate, Failure, FailureKind, Frame
 from gknet.geometry import Camera, Pose
 from tests.strategies import boxes
 
@@ -102,12 +102,12 @@ def test_phase_angle(sun: tuple[float, float, float], angle: float) -> None:
 
 
 def test_estimate_is_a_pose_or_a_reason() -> None:
-    Estimate(failure="no peak")
+    Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))
     Estimate(cam_from_body=Pose.identity())
     with pytest.raises(GknetError, match="reason"):
         Estimate()
     with pytest.raises(GknetError, match="reason"):
-        Estimate(cam_from_body=Pose.identity(), failure="no peak")
+        Estimate(cam_from_body=Pose.identity(), failure=Failure(FailureKind.NO_CONSENSUS, "dark"))
 
 
 def test_a_pose_is_doubted_when_more_is_believed_of_other_attitudes() -> None:
@@ -116,4 +116,4 @@ def test_a_pose_is_doubted_when_more_is_believed_of_other_attitudes() -> None:
         Estimate(cam_from_body=pose, attitude_confidence=belief).is_ambiguous for belief in (None, 0.0, 0.49, 0.5, 1.0)
     ]
     assert doubted == [False, True, True, False, False]
-    assert not Estimate(failure="dark").is_ambiguous
+    assert not Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark")).is_ambiguous

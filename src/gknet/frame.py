@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -124,8 +125,72 @@ class Keypoints:
     covariance_px2: Float[ndarray, "n 2 2"]
 
 
+class FailureKind(StrEnum):
+    """Why there is no pose, as a word that a program can branch on. Files and tables hold the word.
+
+    The first group comes from the input and the locator, the second from the pose solver, the third from the checks of
+    a pose that was found.
+    """
+
+    UNREADABLE_IMAGE = "unreadable_image"
+    """The picture cannot be read, or its camera does not fit it."""
+    NO_SPACECRAFT = "no_spacecraft"
+    """The locator finds no spacecraft in the picture."""
+    NO_KEYPOINT_IN_VIEW = "no_keypoint_in_view"
+    """By its labels, the picture shows no keypoint."""
+    BOX_OUTSIDE_IMAGE = "box_outside_image"
+    """The box given has no part in the picture."""
+    NOT_FINITE = "not_finite"
+    """The network's output is not finite."""
+
+    TOO_FEW_KEYPOINTS = "too_few_keypoints"
+    """Fewer keypoints than a pose needs have a sufficient score."""
+    NO_CONSENSUS = "no_consensus"
+    """No pose agrees with four keypoints."""
+    NO_SOLUTION = "no_solution"
+    """A solver without outlier rejection returned no pose."""
+
+    TOO_FEW_INLIERS = "too_few_inliers"
+    """A pose was found, but too few keypoints agree with it."""
+    BEHIND_CAMERA = "behind_camera"
+    """The pose puts the spacecraft behind the camera."""
+    REPROJECTION_ERROR = "reprojection_error"
+    """The keypoints lie too far from where the pose projects them."""
+    DEGENERATE_GEOMETRY = "degenerate_geometry"
+    """The keypoints that agree do not determine the pose, as when they lie on a line."""
+    BOX_CONTRADICTION = "box_contradiction"
+    """The pose, which few keypoints support, makes the spacecraft much larger or smaller than its box."""
+    IMPLAUSIBLE_SIZE = "implausible_size"
+    """The pose makes the spacecraft far larger or smaller than the crop it was found in."""
+
+    @property
+    def label(self) -> str:
+        """The word as it is shown to people: spaces instead of underscores."""
+        return self.value.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why there is no pose. `str(failure)` is its detail.
+
+    Attributes:
+        kind: what a program branches on; the same cause always has the same kind.
+        detail: one line for people, with the numbers of this picture. Its wording may change between versions.
+    """
+
+    kind: FailureKind
+    detail: str
+
+    def __str__(self) -> str:
+        return self.detail
+
+    def to_dict(self) -> dict[str, str]:
+        """Ready for JSON: `{"kind": ..., "detail": ...}`."""
+        return {"kind": self.kind.value, "detail": self.detail}
+
+
 AMBIGUOUS_BELOW = 0.5
-"""A belief in the attitude below this is a doubt that is put in words."""
+"""An attitude confidence below this makes a pose ambiguous."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +213,7 @@ class Estimate:
     inliers: Bool[ndarray, " n"] | None = None
     reprojection_rms_px: float | None = None
     box: Box | None = None
-    failure: str | None = None
+    failure: Failure | None = None
     attitude_confidence: float | None = None
 
     def __post_init__(self) -> None:
@@ -163,7 +228,22 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A picture that is listed but cannot be had, and why."""
+    """A picture that is listed but cannot be read, and why.
+
+    Attributes:
+        name: the picture's name, as that of a `Frame`.
+        failure: why it cannot be read; its kind is `unreadable_image` unless there is a better one.
+    """
 
     name: str
-    reason: str
+    failure: Failure
+
+    @staticmethod
+    def because(name: str, reason: object) -> Unreadable:
+        """A picture that cannot be read.
+
+        Args:
+            name: the picture's name.
+            reason: an error or a sentence; its text becomes the failure's detail.
+        """
+        return Unreadable(name, Failure(FailureKind.UNREADABLE_IMAGE, str(reason)))

@@ -72,7 +72,7 @@ def test_page_holds_everything_and_agrees(
     for protocol, found in metrics["runs"].items():
         assert found["frames"] == 10
         assert found["sequences"] == 2
-        assert found["failures"] == {"the locator sees no spacecraft": 1}
+        assert found["failures"] == {"no_spacecraft": 1}
         assert len(found["keypoints"]) == 13
         for name, statistic in found["metrics"].items():
             if (protocol, name) == ("oracle", "locator_iou"):
@@ -124,7 +124,7 @@ def test_lost_image_is_passed_over(use: Use, tmp_path: Path, capsys: pytest.Capt
     (root / "data" / "000001" / "image" / "000002.jpg").write_bytes(b"x")
     metrics, _ = evaluated(root, tmp_path / "out")
     assert metrics["runs"]["detected"]["frames"] == 2
-    assert "000002.jpg" in metrics["passed_over"][0]["reason"]
+    assert "000002.jpg" in metrics["passed_over"][0]["failure"]["detail"]
     assert "1 frames were passed over" in capsys.readouterr().out
 
 
@@ -146,7 +146,7 @@ def test_a_bad_label_is_passed_over_and_never_run(
         writer.writerows(rows)
     metrics, _ = evaluated(root, tmp_path / "out")
     assert metrics["runs"]["detected"]["frames"] == 2
-    assert "row 2: position" in metrics["passed_over"][0]["reason"]
+    assert "row 2: position" in metrics["passed_over"][0]["failure"]["detail"]
     assert "1 frames were passed over" in capsys.readouterr().out
     assert not mark.exists()
     assert run(["predict", str(root), "--spacecraft", "toycraft", "--out", str(tmp_path / "poses")]) == 0

@@ -106,11 +106,9 @@ def test_csv_says_the_same_as_jsonl(use: Use, pictures: Path, tmp_path: Path) ->
     with open(out / "poses.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     for row, record in zip(rows, records(out), strict=True):
-        assert (row["name"], row["status"], row["failure"]) == (
-            record["name"],
-            record["status"],
-            record["failure"] or "",
-        )
+        failure = record["failure"] or {"kind": "", "detail": ""}
+        assert (row["name"], row["status"]) == (record["name"], record["status"])
+        assert (row["failure_kind"], row["failure_detail"]) == (failure["kind"], failure["detail"])
         if record["status"] == "ok":
             assert [float(row[key]) for key in ("tx_m", "ty_m", "tz_m")] == record["translation_m"]
             assert [float(row[key]) for key in ("qw", "qx", "qy", "qz")] == record["quaternion_wxyz"]
@@ -177,8 +175,8 @@ def test_no_pose_at_all_is_two_but_is_recorded(use: Use, refused: Refused, pictu
     use(ToyEstimator(blind=frozenset({0})))
     out = tmp_path / "out"
     line = refused("predict", pictures / "a.jpg", *MODEL, *LENS, "--out", out)
-    assert "no pose in any of 1 pictures; the first, a.jpg: the locator sees no spacecraft" in line
-    assert records(out)[0]["failure"] == "the locator sees no spacecraft"
+    assert "no pose in any of 1 pictures; the first, a.jpg: the locator finds no spacecraft" in line
+    assert records(out)[0]["failure"]["kind"] == "no_spacecraft"
 
 
 CAMERA_TEXTS = {

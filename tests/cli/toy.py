@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from gknet.dataset.skd_format import Annotation, row_of
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
-from gknet.frame import Box, Estimate, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.io.atomic import write_text
 from gknet.spacecraft import Spacecraft, spacecraft_toml
@@ -104,7 +104,7 @@ class ToyEstimator:
     def estimate(self, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
         number = picture_number(image)
         if number in self.blind:
-            return Estimate(failure="the locator sees no spacecraft")
+            return Estimate(failure=Failure(FailureKind.NO_SPACECRAFT, "the locator finds no spacecraft"))
         truth, random = toy_pose(number), np.random.default_rng([9, number])
         pixels = camera.project(truth.transform(self.spacecraft.points_m))
         count = len(pixels)

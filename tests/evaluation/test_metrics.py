@@ -20,7 +20,7 @@ from gknet.evaluation.metrics import (
     pose_errors,
     summarise,
 )
-from gknet.frame import Box, Estimate, Frame, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.spacecraft import Spacecraft
@@ -121,11 +121,13 @@ def test_nees_of_drawn_errors_is_six() -> None:
 
 def test_a_failure_counts() -> None:
     seen = estimate_at(POSE, 2.0).keypoints
-    found = compute_errors(FRAME, Estimate(seen, box=FRAME.true_box(POINTS), failure="no pose"), CRAFT)
+    found = compute_errors(
+        FRAME, Estimate(seen, box=FRAME.true_box(POINTS), failure=Failure(FailureKind.NO_CONSENSUS, "no pose")), CRAFT
+    )
     assert (found.e_t, found.add, found.add_below_tenth, found.nees) == (1, 1, 0, None)
     assert found.e_q_rad == pytest.approx(np.pi)
     assert found.rmse_px == pytest.approx(2 * oracle_crop(FRAME, CRAFT).scale)
-    blind = compute_errors(FRAME, Estimate(failure="the locator sees no spacecraft"), CRAFT)
+    blind = compute_errors(FRAME, Estimate(failure=Failure(FailureKind.NO_SPACECRAFT, "nothing found")), CRAFT)
     assert blind.rmse_px == pytest.approx(256 * np.sqrt(2))
     assert blind.pck_10 == blind.locator_iou == 0
 
@@ -154,17 +156,17 @@ def many(sequences: int, frames: int, seed: int) -> list[FrameErrors]:
         level = generator.normal(10, 2)
         for k in range(frames):
             e_t = 1.0 if k % 10 == 9 else 0.01
-            reason = f"only {k} points" if k % 10 == 9 else None
+            kind = FailureKind.TOO_FEW_INLIERS if k % 10 == 9 else None
             rmse = level + generator.normal(0, 0.5)
-            known = {"rmse_px": rmse, "e_t": e_t, "failure": reason, "earth_in_view": float(s % 3 == 0)}
-            known["attitude_confidence"] = None if reason else 0.3 if s == 0 else 0.9
+            known = {"rmse_px": rmse, "e_t": e_t, "failure": kind, "earth_in_view": float(s % 3 == 0)}
+            known["attitude_confidence"] = None if kind else 0.3 if s == 0 else 0.9
             found.append(replace(one, name=f"{s}/{k}", sequence=str(s), **known))
     return found
 
 
 def test_summary_counts_everything() -> None:
     summary = summarise(many(6, 20, 0))
-    assert (summary.frames, summary.sequences, summary.failures) == (120, 6, {"only # points": 12})
+    assert (summary.frames, summary.sequences, summary.failures) == (120, 6, {FailureKind.TOO_FEW_INLIERS: 12})
     assert summary.metrics["e_t"].mean == pytest.approx(0.1 + 0.9 * 0.01)
     assert summary.metrics["e_t"].median == 0.01
     assert all(statistic.frames == 120 for statistic in summary.metrics.values())

@@ -13,7 +13,7 @@ import pytest
 import gknet.inference.estimator as estimating
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import compute_errors
-from gknet.frame import Box, Frame
+from gknet.frame import Box, Failure, FailureKind, Frame
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop import Crop
@@ -228,14 +228,17 @@ def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
 
 def test_failures_are_values_with_reasons() -> None:
     estimator, frame = perfect(POSES["middle"])
-    assert estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50)).failure == "the box lies outside the image"
+    outside = estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50))
+    assert outside.failure == Failure(FailureKind.BOX_OUTSIDE_IMAGE, "the box lies outside the image")
     blind = Estimator(lambda images: NetworkOutput(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
     estimate = blind.estimate(frame.image, CAMERA, frame.true_box(POINTS))
     assert estimate.failure is not None
-    assert "0 keypoints" in estimate.failure
+    assert estimate.failure.kind == FailureKind.TOO_FEW_KEYPOINTS
+    assert "0 keypoints" in str(estimate.failure)
     assert estimate.keypoints is not None
     lost = Estimator(estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32))
-    assert lost.estimate(frame.image, CAMERA).failure == "the locator sees no spacecraft"
+    not_found = lost.estimate(frame.image, CAMERA)
+    assert not_found.failure == Failure(FailureKind.NO_SPACECRAFT, "the locator finds no spacecraft")
 
 
 @pytest.mark.parametrize("range_factor", [0.02, 100.0])
@@ -251,7 +254,8 @@ def test_a_pose_of_another_size_than_the_crop_is_refused(range_factor: float, mo
     monkeypatch.setattr(estimating, "solve_pnp", solve)
     estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
     assert estimate.cam_from_body is None
-    assert "crops large" in str(estimate.failure)
+    assert estimate.failure is not None
+    assert estimate.failure.kind == FailureKind.IMPLAUSIBLE_SIZE
 
 
 def test_thresholds_are_in_pixels_of_the_input() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import nees, pose_error_vector
-from gknet.frame import Box, Estimate, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.pnp import PnpResult, PnpSettings, solve_pnp
 from tests.strategies import quaternions
@@ -120,8 +120,9 @@ def test_fewer_than_four_is_a_reason(left: int) -> None:
     keypoints = detections(POSE)
     score = np.where(np.arange(16) < left, 0.9, 0.0)
     reason = solve_pnp(Keypoints(keypoints.pixels, score, keypoints.covariance_px2), CAMERA, POINTS)
-    assert isinstance(reason, str)
-    assert f"only {left}" in reason
+    assert isinstance(reason, Failure)
+    assert reason.kind == FailureKind.TOO_FEW_KEYPOINTS
+    assert f"only {left}" in reason.detail
 
 
 def test_exactly_four_is_enough() -> None:
@@ -137,20 +138,20 @@ def test_nonsense_is_a_reason() -> None:
     for _ in range(20):
         keypoints = detections(POSE)
         anywhere = Keypoints(generator.uniform(200, 800, (16, 2)), keypoints.score, keypoints.covariance_px2)
-        refused += isinstance(solve_pnp(anywhere, CAMERA, POINTS), str)
+        refused += isinstance(solve_pnp(anywhere, CAMERA, POINTS), Failure)
     assert refused >= 18
 
 
 def test_points_on_a_line_are_a_reason() -> None:
     line = np.linspace(-2, 2, 8)[:, None] * np.array([[1.0, 0.2, 0.1]])
-    assert isinstance(solve_pnp(detections(POSE, points=line), CAMERA, line), str)
+    assert isinstance(solve_pnp(detections(POSE, points=line), CAMERA, line), Failure)
 
 
 def test_all_keypoints_in_one_place_is_a_reason() -> None:
     keypoints = detections(POSE)
     same = Keypoints(np.full((16, 2), 500.0), keypoints.score, keypoints.covariance_px2)
     result = solve_pnp(same, CAMERA, POINTS)
-    assert isinstance(result, str) or result.cam_from_body.translation_m[2] > 100
+    assert isinstance(result, Failure) or result.cam_from_body.translation_m[2] > 100
 
 
 def test_thresholds_follow_the_size_of_an_input_pixel() -> None:
@@ -158,7 +159,7 @@ def test_thresholds_follow_the_size_of_an_input_pixel() -> None:
     generator = np.random.default_rng(4)
     keypoints = noisy(detections(POSE, sigma_px=12.0), generator)
     strict = PnpSettings(threshold_px=(5.0,), min_inlier_fraction=0.8)
-    assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 1.0, strict), str)
+    assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 1.0, strict), Failure)
     assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 8.0, strict), PnpResult)
 
 
@@ -309,8 +310,9 @@ def test_few_keypoints_at_odds_with_the_box_are_refused() -> None:
         box = box_of(Pose(POSE.rotation, POSE.translation_m * factor))
         settings = PnpSettings(max_box_ratio=1.2 if factor < 1 else 2.0)
         result = solve_pnp(few, CAMERA, POINTS, 1.0, settings, box)
-        assert isinstance(result, str)
-        assert words in result
+        assert isinstance(result, Failure)
+        assert result.kind == FailureKind.BOX_CONTRADICTION
+        assert words in result.detail
         assert isinstance(solve_pnp(many, CAMERA, POINTS, 1.0, settings, box), PnpResult)
         assert isinstance(solve_pnp(few, CAMERA, POINTS), PnpResult)
     assert isinstance(solve_pnp(few, CAMERA, POINTS, box=box_of(POSE)), PnpResult)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gknet.frame import Box, Estimate, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Pose
 from gknet.io.pose_file import PoseWriter, csv_columns, csv_row, record, unreadable_record
 
@@ -52,14 +52,16 @@ def test_record_holds_the_estimate() -> None:
     "entry",
     [
         record("x", None, estimate(), NAMES),
-        record("x", 1.0, Estimate(failure="dark"), NAMES),
-        unreadable_record("x", "truncated"),
+        record("x", 1.0, Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark")), NAMES),
+        unreadable_record("x", Failure(FailureKind.UNREADABLE_IMAGE, "truncated")),
     ],
 )
 def test_rows_fit_their_columns(entry: dict[str, object]) -> None:
     row = dict(zip(csv_columns(NAMES), csv_row(entry, NAMES), strict=True))
     assert row["name"] == "x"
     assert row["status"] == entry["status"]
+    failure = entry["failure"] or {"kind": None, "detail": None}
+    assert {"kind": row["failure_kind"], "detail": row["failure_detail"]} == failure
     assert (row["tz_m"] == 30) == (entry["status"] == "ok")
 
 
@@ -73,7 +75,7 @@ def test_file_appears_at_the_end_only(tmp_path: Path) -> None:
     path = tmp_path / "poses.jsonl"
     with PoseWriter(path, NAMES, "jsonl") as writer:
         writer.add("x", None, estimate())
-        writer.add_unreadable("y", "gone")
+        writer.add_unreadable("y", Failure(FailureKind.UNREADABLE_IMAGE, "gone"))
         assert not path.exists()
     assert [json.loads(line)["name"] for line in path.read_text().splitlines()] == ["x", "y"]
     other = PoseWriter(tmp_path / "other.csv", NAMES, "csv")

@@ -53,7 +53,7 @@ def test_video_says_when_it_ends_early(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(type(source.video), "frames", lambda self, every: list(whole(self, every))[:5])
     *_, last = open_source(path, LENS, TOY)
     assert isinstance(last, Unreadable)
-    assert "ends after 5 of 12" in last.reason
+    assert "ends after 5 of 12" in last.failure.detail
 
 
 def test_dataset_frames_carry_truth(tmp_path: Path) -> None:

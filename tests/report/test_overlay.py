@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gknet.errors import GknetError
-from gknet.frame import Estimate, Frame, Keypoints
+from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.report.canvas import Canvas
@@ -51,7 +51,7 @@ def test_marks_lie_where_the_estimate_says() -> None:
 def test_hidden_keypoints_are_hollow() -> None:
     frame = toy_frame()
     estimate = toy_estimate(frame)
-    alone = Estimate(estimate.keypoints, box=estimate.box, failure="no pose was sought")
+    alone = Estimate(estimate.keypoints, box=estimate.box, failure=Failure(FailureKind.NO_SOLUTION, "not estimated"))
     picture = draw_overlay(frame, TOY, alone, lines=(), truth=False, legend=False)
     for k in np.flatnonzero(estimate.keypoints.score > 0.4):
         colour = score_colour(float(estimate.keypoints.score[k]))
@@ -69,7 +69,11 @@ def test_input_is_left_alone_and_result_repeats() -> None:
 @pytest.mark.parametrize(("size", "factor"), [(64, 12), (256, 3), (1024, 1), (1400, 1)])
 def test_small_pictures_are_enlarged_by_whole_factors(size: int, factor: int) -> None:
     frame = toy_frame(size=size)
-    assert draw_overlay(frame, TOY, Estimate(failure="dark")).shape == (size * factor, size * factor, 3)
+    assert draw_overlay(frame, TOY, Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))).shape == (
+        size * factor,
+        size * factor,
+        3,
+    )
 
 
 def test_odd_estimates_are_borne() -> None:
@@ -81,7 +85,7 @@ def test_odd_estimates_are_borne() -> None:
     for pose in (behind, inside):
         draw_overlay(frame, TOY, Estimate(wild, pose, np.eye(6), np.ones(count, dtype=bool)))
     with pytest.raises(GknetError, match="needs its image"):
-        draw_overlay(Frame("x", None, frame.camera), TOY, Estimate(failure="dark"))
+        draw_overlay(Frame("x", None, frame.camera), TOY, Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark")))
 
 
 def test_zoom_moves_marks_with_the_picture() -> None:
@@ -102,8 +106,8 @@ def test_words() -> None:
     assert words[1] == f"range {frame.range_m:.2f} m ± 0.05 m"
     assert words[2].endswith("13 of 13 keypoints")
     assert confidence(estimate) == pytest.approx(estimate.keypoints.score.mean())
-    assert describe(frame, Estimate(failure="dark")) == ["toy/1", "no pose: dark"]
-    assert confidence(Estimate(failure="dark")) is None
+    assert describe(frame, Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))) == ["toy/1", "no pose: dark"]
+    assert confidence(Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))) is None
     for belief, said in ((0.97, "belief in the attitude 0.97"), (0.31, "belief in the attitude 0.31, perhaps a twin")):
         assert describe(frame, replace(estimate, attitude_confidence=belief))[3] == said
 

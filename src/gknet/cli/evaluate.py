@@ -86,4 +86,4 @@ def tell_gaps(evaluation: Evaluation) -> None:
         typer.echo(f"unknown, no column '{column}': {UNKNOWN_WORDS[column]}")
     bad = evaluation.passed_over
     if bad:
-        typer.echo(f"{len(bad)} frames were passed over; the first, {bad[0].name}: {bad[0].reason}")
+        typer.echo(f"{len(bad)} frames were passed over; the first, {bad[0].name}: {bad[0].failure}")

@@ -130,7 +130,7 @@ def tell(files: PredictionWriter) -> None:
 
     failures = files.failures
     if files.pose_count == 0:
-        first = f"; the first, {failures[0].name}: {failures[0].reason}" if failures else ""
+        first = f"; the first, {failures[0].name}: {failures[0].failure}" if failures else ""
         raise GknetError(f"no pose in any of {files.count} pictures{first}")
     typer.echo(f"{files.pose_count} of {files.count} pictures have a pose, {len(failures)} failed")
     if files.ambiguous_count:
@@ -138,7 +138,7 @@ def tell(files: PredictionWriter) -> None:
             f"  {files.ambiguous_count} of the poses may be a twin's: attitude_confidence is below {AMBIGUOUS_BELOW}"
         )
     for failure in failures[:_SHOWN_FAILURES]:
-        typer.echo(f"  {failure.name}: {failure.reason}")
+        typer.echo(f"  {failure.name}: {failure.failure}")
     if len(failures) > _SHOWN_FAILURES:
         typer.echo(f"  and {len(failures) - _SHOWN_FAILURES} more, in {files.poses_path}")
     for path in (files.poses_path, files.overlay_folder, files.video_path):

@@ -15,7 +15,7 @@ from numpy import ndarray
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import FrameErrors, Summary, compute_errors, keypoint_errors_px, oracle_crop, summarise
-from gknet.frame import Estimate, Frame, Keypoints, Unreadable
+from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints, Unreadable
 from gknet.inference.crop import Crop
 from gknet.inference.locate import CropEstimator
 from gknet.spacecraft import Spacecraft
@@ -94,7 +94,7 @@ class Evaluation:
             "spacecraft": self.spacecraft.name,
             "data": self.data,
             "unknown": list(self.unknown),
-            "passed_over": [{"name": bad.name, "reason": bad.reason} for bad in self.passed_over],
+            "passed_over": [{"name": bad.name, "failure": bad.failure.to_dict()} for bad in self.passed_over],
             "runs": {run.protocol: self._run_dict(run) for run in self.runs},
         }
 
@@ -155,20 +155,30 @@ def evaluate(
     cases: dict[Protocol, list[Case]] = {protocol: [] for protocol in protocols}
     passed_over = []
     for i in range(len(dataset)):
-        try:
-            frame = dataset.frame(i)
-            oracle_crop(frame, estimator.spacecraft)
-        except GknetError as error:
-            passed_over.append(Unreadable(f"{dataset.sequence_of(i)}, frame {i}", str(error)))
+        frame = _judged_frame(dataset, i, estimator.spacecraft)
+        if isinstance(frame, Unreadable):
+            passed_over.append(frame)
         else:
             for protocol in protocols:
                 cases[protocol].append(_case(i, frame, dataset.sequence_of(i), estimator, protocol))
         on_frame()
     if not any(cases.values()):
-        first = f"; the first: {passed_over[0].reason}" if passed_over else ""
+        first = f"; the first: {passed_over[0].failure}" if passed_over else ""
         raise GknetError(f"evaluation: none of {len(dataset)} frames could be used{first}")
     runs = tuple(ProtocolRun(protocol, tuple(cases[protocol])) for protocol in protocols)
     return Evaluation(estimator.spacecraft, data or str(dataset.root), runs, tuple(passed_over))
+
+
+def _judged_frame(dataset: SkdDataset, index: int, spacecraft: Spacecraft) -> Frame | Unreadable:
+    """A frame that shows a keypoint at least, or why it cannot be judged."""
+    name = f"{dataset.sequence_of(index)}, frame {index}"
+    try:
+        frame = dataset.frame(index)
+        if frame.true_box(spacecraft.points_m) is not None:
+            return frame
+    except GknetError as error:
+        return Unreadable.because(name, error)
+    return Unreadable(name, Failure(FailureKind.NO_KEYPOINT_IN_VIEW, f"frame {frame.name}: no keypoint is in view"))
 
 
 def _case(index: int, frame: Frame, sequence: str, estimator: CropEstimator, protocol: Protocol) -> Case:

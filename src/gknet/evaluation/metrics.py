@@ -7,7 +7,7 @@ mean states how many frames it is over, and failures count (E_t = 1, E_q = pi, A
 
 from __future__ import annotations
 
-import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gknet.errors import GknetError
-from gknet.frame import Estimate, Frame, Keypoints
+from gknet.frame import Estimate, FailureKind, Frame, Keypoints
 from gknet.geometry import Pose
 from gknet.inference.crop import Crop
 from gknet.spacecraft import Spacecraft
@@ -56,7 +56,7 @@ class FrameErrors:
 
     name: str
     sequence: str
-    failure: str | None
+    failure: FailureKind | None
     rmse_px: float | None
     rmse_hidden_px: float | None
     pck_2: float | None
@@ -109,7 +109,7 @@ def compute_errors(
     return FrameErrors(
         name=frame.name,
         sequence=frame.name if sequence is None else sequence,
-        failure=estimate.failure,
+        failure=None if estimate.failure is None else estimate.failure.kind,
         rmse_px=_rms(distance[in_view]),
         rmse_hidden_px=None if hidden is None else _rms(distance[hidden]),
         pck_2=_part_below(distance[in_view], 2),
@@ -231,13 +231,13 @@ class Bin:
 class Summary:
     """Of many frames. The coverages are of the poses' 6x6 covariances, over the frames that have a pose.
 
-    failures     frames per reason, its numbers written as #
+    failures     frames without a pose per kind of failure, the most frequent first
     located_07   part of the frames whose box overlaps the true one by an IoU of 0.7 or more
     """
 
     frames: int
     sequences: int
-    failures: dict[str, int]
+    failures: dict[FailureKind, int]
     metrics: dict[str, Statistic]
     located_07: float | None
     coverage_68: float | None
@@ -258,7 +258,7 @@ def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int
     return Summary(
         frames=len(frame_errors),
         sequences=len({e.sequence for e in frame_errors}),
-        failures=_reasons(frame_errors),
+        failures=dict(Counter(e.failure for e in frame_errors if e.failure is not None).most_common()),
         metrics=_statistics(frame_errors, seed, resamples),
         located_07=float(np.mean(np.array(ious) >= 0.7)) if ious else None,
         coverage_68=_coverage(squared, 0.68),
@@ -270,15 +270,6 @@ def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int
 def _coverage(squared: Float[ndarray, " k"], part: float) -> float | None:
     """How many true poses lie inside the ellipsoid that should hold this part of them."""
     return float((squared <= chi2.ppf(part, 6)).mean()) if len(squared) else None
-
-
-def _reasons(frame_errors: Sequence[FrameErrors]) -> dict[str, int]:
-    reasons: dict[str, int] = {}
-    for error in frame_errors:
-        if error.failure is not None:
-            reason = re.sub(r"\d+(\.\d+)?", "#", error.failure)
-            reasons[reason] = reasons.get(reason, 0) + 1
-    return reasons
 
 
 def _statistics(frame_errors: Sequence[FrameErrors], seed: int, resamples: int) -> dict[str, Statistic]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Estimate, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.inference.locate import KeypointNetwork, check_image, network_input
@@ -45,7 +45,7 @@ class PaperEstimator:
         keypoints = Keypoints(pixels, np.ones(count), np.tile(np.eye(2) / crop.scale**2, (count, 1, 1)))
         pose = plain_pnp(pixels, camera, self.spacecraft.points_m)
         if pose is None:
-            return Estimate(keypoints, box=box, failure="the solver found no pose")
+            return Estimate(keypoints, box=box, failure=Failure(FailureKind.NO_SOLUTION, "the solver found no pose"))
         inliers = np.ones(count, dtype=bool)
         off = camera.project(pose.transform(self.spacecraft.points_m)) - pixels
         return Estimate(keypoints, pose, None, inliers, float(np.sqrt((off**2).sum(axis=1).mean())), box)

@@ -21,7 +21,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Estimate, Keypoints
+from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins, rotation_of, wxyz_of
 from gknet.inference.crop import Crop
@@ -145,7 +145,7 @@ class DirectEstimator(CropEstimator):
         output = self.network(network_input(image, crop))[0]
         seen = decode_output(output, self.bins)
         if seen is None:
-            return Estimate(box=box, failure="the network's answer is not finite")
+            return Estimate(box=box, failure=Failure(FailureKind.NOT_FINITE, "the network's output is not finite"))
         pose = seen.pose(camera, crop, self.spacecraft.diameter_m)
         contradiction = self.contradiction(pose, camera, crop)
         if contradiction is not None:

@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Estimate
+from gknet.frame import Box, Estimate, Failure, FailureKind
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.inference.decode import decode_locator
@@ -104,10 +104,10 @@ class CropEstimator(ABC):
             )
         box = box or self.locate(image)
         if box is None:
-            return Estimate(failure="the locator sees no spacecraft")
+            return Estimate(failure=Failure(FailureKind.NO_SPACECRAFT, "the locator finds no spacecraft"))
         inside = box.clipped(camera.width, camera.height)
         if inside is None:
-            return Estimate(box=box, failure="the box lies outside the image")
+            return Estimate(box=box, failure=Failure(FailureKind.BOX_OUTSIDE_IMAGE, "the box lies outside the image"))
         return self.estimate_in(image, camera, inside)
 
     def locate(self, image: UInt8[ndarray, "h w *c"]) -> Box | None:
@@ -120,13 +120,17 @@ class CropEstimator(ABC):
         whole = Crop((width - side) // 2, (height - side) // 2, side, self.settings.locator_size)
         return self._locate_in(image, whole)
 
-    def contradiction(self, cam_from_body: Pose, camera: Camera, crop: Crop) -> str | None:
+    def contradiction(self, cam_from_body: Pose, camera: Camera, crop: Crop) -> Failure | None:
         """Why a pose cannot belong to the crop that it was found in; None when it can."""
         range_m = np.linalg.norm(cam_from_body.translation_m)
         ratio = float(camera.matrix[0, 0] * self.spacecraft.diameter_m / range_m) / crop.side
         if PLAUSIBLE_SIZE[0] <= ratio <= PLAUSIBLE_SIZE[1]:
             return None
-        return f"the pose makes the spacecraft {ratio:.2g} crops large"
+        return Failure(
+            FailureKind.IMPLAUSIBLE_SIZE,
+            f"the pose makes the spacecraft {ratio:.2g} times as large as its crop, "
+            f"expected {PLAUSIBLE_SIZE[0]:g} to {PLAUSIBLE_SIZE[1]:g}",
+        )
 
     def _locate_in(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> Box | None:
         if self.locator is None:

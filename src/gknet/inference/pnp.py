@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Keypoints
+from gknet.frame import Box, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 
 ROBUST_SIGMAS = 3.0
@@ -104,7 +104,7 @@ def solve_pnp(
     input_px: float = 1.0,
     settings: PnpSettings | None = None,
     box: Box | None = None,
-) -> PnpResult | str:
+) -> PnpResult | Failure:
     """The pose that explains the keypoints, or the reason why there is none.
 
     input_px   size of one pixel of the network's input in image pixels (1 / Crop.scale)
@@ -116,7 +116,10 @@ def solve_pnp(
         raise GknetError(f"pnp: expected {len(points_m)} keypoints, one for each point, got {len(keypoints.score)}")
     usable = _usable(keypoints, settings.min_score)
     if usable.sum() < 4:
-        return f"only {usable.sum()} keypoints are sure enough, a pose needs 4"
+        return Failure(
+            FailureKind.TOO_FEW_KEYPOINTS,
+            f"only {usable.sum()} keypoints have a score of {settings.min_score:g} or more, a pose needs 4",
+        )
     problem = _Problem(
         points_m,
         np.flatnonzero(usable),
@@ -125,7 +128,7 @@ def solve_pnp(
         camera,
         None if box is None else _Edges.of(box, camera, settings.box_sigma),
     )
-    result: PnpResult | str = "no keypoint threshold was tried"
+    result: PnpResult | Failure = Failure(FailureKind.NO_CONSENSUS, "no keypoint threshold was tried")
     alone = replace(problem, edges=None)  # a wrong box must not cost the pose
     for each in (alone,) if box is None else (problem, alone):
         for threshold in settings.threshold_px:
@@ -139,7 +142,7 @@ def solve_pnp(
     return result
 
 
-def _against_box(problem: _Problem, edges: _Edges, result: PnpResult, max_ratio: float) -> PnpResult | str:
+def _against_box(problem: _Problem, edges: _Edges, result: PnpResult, max_ratio: float) -> PnpResult | Failure:
     """The result, or that so few keypoints are at odds with the box. One whose longer side is cut tells nothing."""
     if 2 * result.inliers.sum() >= len(problem.points_m):
         return result
@@ -151,7 +154,10 @@ def _against_box(problem: _Problem, edges: _Edges, result: PnpResult, max_ratio:
     ratio = np.ptp(pixels) / (high - low)[axis]
     if 1 / max_ratio <= ratio <= max_ratio:
         return result
-    return f"{result.inliers.sum()} keypoints make the spacecraft {ratio:.2g} times as large as its box"
+    return Failure(
+        FailureKind.BOX_CONTRADICTION,
+        f"the pose of only {result.inliers.sum()} keypoints makes the spacecraft {ratio:.2g} times as large as its box",
+    )
 
 
 def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, " n"]:
@@ -165,26 +171,33 @@ def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, " n"]:
 
 def _solve(
     problem: _Problem, score: Float[ndarray, " k"], threshold_px: float, input_px: float, settings: PnpSettings
-) -> PnpResult | str:
+) -> PnpResult | Failure:
     """One round: consensus, refinement, then every reason to disbelieve it."""
     start = _consensus(problem, score, threshold_px)
     if start is None:
-        return "no pose agrees with enough keypoints"
+        return Failure(FailureKind.NO_CONSENSUS, "no pose agrees with enough keypoints")
     near = _residuals_px(problem, start) < 2 * threshold_px
     pose = _refine(problem, start, near)
     error = _residuals_px(problem, pose)
     inliers = error < threshold_px
     needed = max(min(settings.min_inliers, len(score)), int(np.ceil(settings.min_inlier_fraction * len(score))))
     if inliers.sum() < needed:
-        return f"only {inliers.sum()} of {len(score)} keypoints agree with one pose, expected {needed}"
+        return Failure(
+            FailureKind.TOO_FEW_INLIERS,
+            f"only {inliers.sum()} of {len(score)} keypoints agree with one pose, expected {needed}",
+        )
     if (pose.transform(problem.usable_m)[inliers, 2] <= 0).any():
-        return "the pose puts the spacecraft behind the camera"
+        return Failure(FailureKind.BEHIND_CAMERA, "the pose puts the spacecraft behind the camera")
     rms = float(np.sqrt((error[inliers] ** 2).mean()))
     if rms > settings.max_rms_px * input_px:
-        return f"the keypoints miss the pose by {rms:.1f} px rms"
+        limit = settings.max_rms_px * input_px
+        return Failure(
+            FailureKind.REPROJECTION_ERROR,
+            f"the keypoints lie {rms:.1f} px rms from where the pose projects them, expected at most {limit:.1f}",
+        )
     covariance = _covariance(problem, pose, inliers)
     if covariance is None:
-        return "the keypoints do not fix the pose (they lie on a line)"
+        return Failure(FailureKind.DEGENERATE_GEOMETRY, "the keypoints do not determine the pose (they lie on a line)")
     return PnpResult(pose, settings.covariance_scale * covariance, inliers, rms)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Estimate
+from gknet.frame import Estimate, Failure
 
 PoseFormat = Literal["jsonl", "csv"]
 
@@ -38,7 +38,7 @@ def record(name: str, time_s: float | None, estimate: Estimate, keypoint_names: 
         "name": name,
         "time_s": time_s,
         "status": "ok" if pose is not None else "no pose",
-        "failure": estimate.failure,
+        "failure": estimate.failure.to_dict() if estimate.failure else None,
         "translation_m": _plain(pose.translation_m) if pose else None,
         "quaternion_wxyz": _plain(pose.quaternion_wxyz) if pose else None,
         "covariance": _plain(estimate.covariance),
@@ -66,9 +66,9 @@ def _keypoint_records(estimate: Estimate, names: Sequence[str]) -> list[dict[str
     ]
 
 
-def unreadable_record(name: str, reason: str) -> dict[str, object]:
+def unreadable_record(name: str, failure: Failure) -> dict[str, object]:
     """The JSON object of a picture that could not be read."""
-    return {"name": name, "time_s": None, "status": "unreadable", "failure": reason}
+    return {"name": name, "time_s": None, "status": "unreadable", "failure": failure.to_dict()}
 
 
 class PoseWriter:
@@ -90,8 +90,8 @@ class PoseWriter:
     def add(self, name: str, time_s: float | None, estimate: Estimate) -> None:
         self._write(record(name, time_s, estimate, self._names))
 
-    def add_unreadable(self, name: str, reason: str) -> None:
-        self._write(unreadable_record(name, reason))
+    def add_unreadable(self, name: str, failure: Failure) -> None:
+        self._write(unreadable_record(name, failure))
 
     def _write(self, entry: dict[str, object]) -> None:
         if self._file is None:
@@ -116,7 +116,8 @@ class PoseWriter:
 
 def csv_columns(keypoint_names: Sequence[str]) -> list[str]:
     """Covariance is its upper triangle, row by row, of (rotation vector, translation)."""
-    columns = ["name", "time_s", "status", "failure", "tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"]
+    columns = ["name", "time_s", "status", "failure_kind", "failure_detail"]
+    columns += ["tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"]
     columns += ["attitude_confidence", "reprojection_rms_px", "inlier_count", "box_x0", "box_y0", "box_x1", "box_y1"]
     columns += [f"covariance_{i}{j}" for i, j in _COVARIANCE_CELLS]
     return columns + [f"{name}_{what}" for name in keypoint_names for what in ("x", "y", "score")]
@@ -129,8 +130,9 @@ def csv_row(entry: dict[str, object], keypoint_names: Sequence[str]) -> list[obj
         values = entry.get(key)
         return list(values) if isinstance(values, list) else [None] * count
 
-    covariance = entry.get("covariance")
-    row: list[object] = [entry["name"], entry["time_s"], entry["status"], entry["failure"]]
+    covariance, failure = entry.get("covariance"), entry["failure"]
+    row: list[object] = [entry["name"], entry["time_s"], entry["status"]]
+    row += [failure["kind"], failure["detail"]] if isinstance(failure, dict) else [None, None]
     row += cells("translation_m", 3) + cells("quaternion_wxyz", 4)
     row += [
         entry.get("attitude_confidence"),

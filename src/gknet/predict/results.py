@@ -79,7 +79,7 @@ class PredictionWriter:
     def add_unreadable(self, picture: Unreadable) -> None:
         """Record a picture that could not be read."""
         if self._poses is not None:
-            self._poses.add_unreadable(picture.name, picture.reason)
+            self._poses.add_unreadable(picture.name, picture.failure)
         self.failures.append(picture)
 
     def __exit__(

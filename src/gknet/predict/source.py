@@ -52,7 +52,7 @@ class ImageFiles:
                 image = read_image(path)
                 camera = camera_for(self.lens, image.shape[1], image.shape[0])
             except GknetError as error:
-                yield Unreadable(name, str(error))
+                yield Unreadable.because(name, error)
             else:
                 yield Frame(name, image, camera)
 
@@ -80,7 +80,7 @@ class VideoFile:
             yield Frame(f"{stem}/{shown.index:06d}", shown.image, camera, time_s=shown.time_s)
         if read < self.count - max(2, self.count // 50):
             reason = f"{self.video.path}: the video ends after {read} of {self.count} frames; is it truncated?"
-            yield Unreadable(f"{stem}/{read * self.every:06d}", reason)
+            yield Unreadable.because(f"{stem}/{read * self.every:06d}", reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class DatasetFrames:
             try:
                 frame = self.dataset.frame(i)
             except GknetError as error:
-                yield Unreadable(f"{self.dataset.sequence_of(i)}: frame {i}", str(error))
+                yield Unreadable.because(f"{self.dataset.sequence_of(i)}: frame {i}", error)
             else:
                 yield frame
 

@@ -122,13 +122,13 @@ def _metric_cells(run: ProtocolRun, metric: str, digits: int) -> str:
 
 
 def _failures(evaluation: Evaluation) -> str:
-    """Reasons of failures and frames that were passed over; nothing where all went well."""
+    """Kinds of failures, with the number of frames, and frames that were passed over; nothing where all went well."""
     items = [
-        f"<li>{escape(PROTOCOL_WORDS[run.protocol])}: {count} x {escape(reason)}</li>"
+        f"<li>{escape(PROTOCOL_WORDS[run.protocol])}: {count} x {escape(kind.label)}</li>"
         for run in evaluation.runs
-        for reason, count in sorted(run.summary.failures.items(), key=lambda item: -item[1])
+        for kind, count in run.summary.failures.items()
     ]
-    items += [f"<li>passed over: {escape(bad.name)}: {escape(bad.reason)}</li>" for bad in evaluation.passed_over]
+    items += [f"<li>passed over: {escape(bad.name)}: {escape(str(bad.failure))}</li>" for bad in evaluation.passed_over]
     if not items:
         return ""
     return f"<details><summary>Failures and why ({len(items)} kinds)</summary><ul>{''.join(items)}</ul></details>"
