@@ -6,7 +6,7 @@ PYTHON ?= python3
 SOURCES := $(shell find src -type f -not -name '*.pyc')
 INSTALL = -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: .venv/installed
 	.venv/bin/gknet demo
@@ -19,6 +19,11 @@ lint: .venv-test/installed
 	.venv-test/bin/ruff format --check .
 	.venv-test/bin/mypy
 
+# The site of docs/ into build/docs; a warning is an error.
+docs: .venv-test/installed
+	.venv-test/bin/sphinx-build -q -W --keep-going -b html docs build/docs
+	@echo "build/docs/index.html"
+
 clean:
 	rm -rf .venv .venv-test build dist demo-output .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
@@ -28,7 +33,7 @@ clean:
 	@touch $@
 
 .venv-test/installed: .venv-test/made pyproject.toml constraints.txt
-	.venv-test/bin/python $(INSTALL) --editable '.[render,train,dev]'
+	.venv-test/bin/python $(INSTALL) --editable '.[render,train,docs,dev]'
 	@touch $@
 
 %/made:

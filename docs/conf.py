@@ -26,8 +26,8 @@ nitpicky = True
 nitpick_ignore_regex = [
     # Libraries whose documentation is on the network, and annotations that carry shapes.
     (r"py:.*", r"(numpy|np|pathlib|pydantic|collections|typing|jaxtyping|cv2)\..*"),
-    (r"py:.*", r"(Path|ndarray|Float|Float32|Bool|Int|UInt8|n|\d.*|.*\*n.*|optional|callable|array-like)"),
-    (r"py:class", r"gknet\.(?!__init__).*"),  # what a public signature mentions and is itself no public name
+    (r"py:class", r"(Path|ndarray|'.*')"),
+    (r"py:class", r"gknet\..*\..*"),  # what a public signature mentions and is itself no public name
 ]
 
 myst_enable_extensions = ["dollarmath", "amsmath", "attrs_inline", "colon_fence", "deflist"]
@@ -37,10 +37,12 @@ suppress_warnings = ["myst.header"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
-napoleon_preprocess_types = False
+napoleon_attr_annotations = False
 
 html_theme = "furo"
 html_title = f"gknet {release}"

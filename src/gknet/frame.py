@@ -15,7 +15,17 @@ from gknet.geometry import Camera, Pose
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned box in pixels: [x0, x1] x [y0, y1]."""
+    """An axis-aligned box in pixels of an image: [x0, x1] x [y0, y1].
+
+    Attributes:
+        x0: Left side in px.
+        y0: Top side in px.
+        x1: Right side in px, greater than x0.
+        y1: Bottom side in px, greater than y0.
+
+    Raises:
+        GknetError: A side is not finite, or the box is empty.
+    """
 
     x0: float
     y0: float
@@ -28,7 +38,14 @@ class Box:
 
     @staticmethod
     def around(pixels: Float[ndarray, "n 2"]) -> Box:
-        """The bounding box of the finite points, at least one pixel wide and high."""
+        """The bounding box of the finite points, at least one pixel wide and high.
+
+        Args:
+            pixels: (n, 2) points in px; NaN rows are left out.
+
+        Raises:
+            GknetError: No point is finite.
+        """
         finite = pixels[np.isfinite(pixels).all(axis=1)]
         if len(finite) == 0:
             raise GknetError("box: no finite point to bound")
@@ -39,19 +56,21 @@ class Box:
 
     @property
     def centre(self) -> tuple[float, float]:
+        """x and y of the centre in px."""
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
 
     @property
     def side(self) -> float:
-        """The longer side."""
+        """Length of the longer side in px."""
         return max(self.x1 - self.x0, self.y1 - self.y0)
 
     @property
     def area(self) -> float:
+        """Area in px^2."""
         return (self.x1 - self.x0) * (self.y1 - self.y0)
 
     def clipped(self, width: int, height: int) -> Box | None:
-        """The part inside an image, or None when nothing is."""
+        """The part inside an image of width x height px, or None when the box lies outside."""
         x0, y0 = max(self.x0, 0.0), max(self.y0, 0.0)
         x1, y1 = min(self.x1, float(width)), min(self.y1, float(height))
         return Box(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
@@ -68,12 +87,17 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture and what is known of it.
+    """One image and what is known of it.
 
-    image          (h, w, 3) uint8 RGB; None where only the labels were read
-    visible        (n,) bool per keypoint: in view and not hidden by the spacecraft; None when unknown
-    sun_direction  unit vector to the sun in the camera frame
-    earth_in_view  whether a part of the Earth is in the picture; None when unknown
+    Attributes:
+        name: Name of the image, for messages and files.
+        image: (h, w, 3) uint8 RGB; None where only the labels were read.
+        camera: The camera of this image.
+        cam_from_body: The true pose; None when unknown.
+        visible: (n,) bool for each keypoint: in view and not hidden by the spacecraft; None when unknown.
+        sun_direction: (3,) unit vector to the sun in the camera frame; None when unknown.
+        time_s: Time in s since the start of the sequence or video; None when unknown.
+        earth_in_view: Whether a part of the Earth is in the image; None when unknown.
     """
 
     name: str
@@ -86,13 +110,33 @@ class Frame:
     earth_in_view: bool | None = None
 
     def keypoints_px(self, points_m: Float[ndarray, "n 3"]) -> Float[ndarray, "n 2"]:
-        """The true keypoints in pixels, projected from the pose; NaN behind the camera."""
+        """The true keypoints in pixels, projected from the true pose.
+
+        Args:
+            points_m: (n, 3) keypoints in the body frame in m.
+
+        Returns:
+            (n, 2) in px of this image; NaN for a point behind the camera.
+
+        Raises:
+            GknetError: The frame has no true pose.
+        """
         if self.cam_from_body is None:
             raise GknetError(f"frame {self.name}: it has no true pose")
         return self.camera.project(self.cam_from_body.transform(points_m))
 
     def true_box(self, points_m: Float[ndarray, "n 3"]) -> Box | None:
-        """The part inside the image of the true keypoints' box (the oracle's crop), None when no keypoint is inside."""
+        """The part of the true keypoints' box that is inside the image, from which the oracle crop is cut.
+
+        Args:
+            points_m: (n, 3) keypoints in the body frame in m.
+
+        Returns:
+            The box in px, or None when no keypoint is inside the image.
+
+        Raises:
+            GknetError: The frame has no true pose.
+        """
         pixels = self.keypoints_px(points_m)
         if not self.camera.contains(pixels).any():
             return None
@@ -100,11 +144,12 @@ class Frame:
 
     @property
     def range_m(self) -> float | None:
+        """True distance from the camera to the body's origin in m; None without a true pose."""
         return None if self.cam_from_body is None else float(np.linalg.norm(self.cam_from_body.translation_m))
 
     @property
     def phase_angle_rad(self) -> float | None:
-        """Angle at the spacecraft between the sun and the camera, 0 (lit from behind the camera) to pi."""
+        """Angle at the spacecraft between the sun and the camera in rad, from 0 (lit from behind the camera) to pi."""
         if self.cam_from_body is None or self.sun_direction is None:
             return None
         to_camera = -self.cam_from_body.translation_m / np.linalg.norm(self.cam_from_body.translation_m)
@@ -115,9 +160,10 @@ class Frame:
 class Keypoints:
     """Detected keypoints in pixels of the full image. Row k is keypoint k of the spacecraft, always.
 
-    pixels          (n, 2)
-    score           (n,) 0 to 1
-    covariance_px2  (n, 2, 2)
+    Attributes:
+        pixels: (n, 2) x and y in px.
+        score: (n,) height of the heatmap's peak, 0 (no peak) to 1.
+        covariance_px2: (n, 2, 2) covariance of x and y in px^2.
     """
 
     pixels: Float[ndarray, "n 2"]
@@ -195,16 +241,21 @@ AMBIGUOUS_BELOW = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The answer for one image. `failure` says why there is no pose, and is None exactly when there is one.
+    """The answer for one image: a pose, or the reason why there is none.
 
-    keypoints         as detected; of a direct estimator, which detects none, where its pose puts them
-    covariance        (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
-                      R_true = exp([dw]x) R, t_true = t + dt
-    inliers           (n,) bool: keypoints that the pose agrees with
-    box               where the spacecraft was looked for, in pixels of the image
-    attitude_confidence   0 to 1: the probability that the network gives to attitudes within 60 degrees of the pose's.
-                      Below a half the pose may be that of a symmetric counterpart, whatever the covariance says. None
-                      when the network estimates no attitude distribution
+    Attributes:
+        keypoints: As detected; of direct pose regression, which detects none, the projected model points. None when
+            the spacecraft was not located.
+        cam_from_body: The pose: p_cam = R p_body + t. None when there is none.
+        covariance: (6, 6) of (rotation vector in rad, translation in m), both in the camera frame:
+            R_true = exp([dw]x) R, t_true = t + dt. None without a pose, and of direct pose regression.
+        inliers: (n,) bool: keypoints that the pose agrees with.
+        reprojection_rms_px: Over the inliers, in px of the image.
+        box: Where the spacecraft was searched for, in px of the image.
+        failure: Why there is no pose; None exactly when there is one.
+        attitude_confidence: 0 to 1: the probability that the network gives to attitudes within 60 degrees of the
+            pose's. Below a half the pose may be that of a symmetric counterpart, whatever the covariance is. None when
+            the network estimates no attitude distribution.
     """
 
     keypoints: Keypoints | None = None
@@ -222,7 +273,7 @@ class Estimate:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the network that saw the keypoints believes more in other attitudes than in the pose's."""
+        """Whether the network gives a higher probability to other attitudes than to the pose's."""
         return self.attitude_confidence is not None and self.attitude_confidence < AMBIGUOUS_BELOW
 
 

@@ -55,11 +55,22 @@ class _File(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Spacecraft:
-    """`points_m` are in the body frame; row k, channel k of a heatmap and node k of the graph are all keypoint k.
+    """A known spacecraft: its keypoints, skeleton and mesh.
 
-    edges        (e, 2) pairs of keypoint indices, i < j: the skeleton, by meaning and nearness
-    diameter_m   the largest distance between two points of the mesh
-    mesh_path    a GLB with PBR materials in metres, None when only the keypoints are known
+    Row k of the keypoints, channel k of a heatmap and node k of the graph are all keypoint k.
+
+    Attributes:
+        name: Such as satellite_01.
+        keypoint_names: A different name for each of the n keypoints.
+        points_m: (n, 3) keypoints in the body frame in m, read-only.
+        edges: Pairs of keypoint indices, i < j: the skeleton, by meaning and nearness.
+        diameter_m: The largest distance between two points of the mesh in m.
+        symmetries: Rotations that leave the spacecraft's appearance nearly unchanged.
+        mesh_path: A GLB with PBR materials in metres; None when only the keypoints are known.
+        description: One sentence for people.
+
+    Raises:
+        GknetError: Shapes do not agree, names repeat, or an edge has no keypoint.
     """
 
     name: str
@@ -90,11 +101,12 @@ class Spacecraft:
 
     @property
     def keypoint_count(self) -> int:
+        """n, the number of keypoints."""
         return len(self.keypoint_names)
 
     @cached_property
     def adjacency(self) -> Bool[ndarray, "n n"]:
-        """A of eq. 3: symmetric, ones on the diagonal, constant for the spacecraft."""
+        """(n, n) bool, symmetric and true on the diagonal; A in eq. 3 of the paper."""
         matrix = np.eye(self.keypoint_count, dtype=bool)
         for i, j in self.edges:
             matrix[i, j] = matrix[j, i] = True
@@ -110,7 +122,14 @@ def diameter(points_m: Float[ndarray, "n 3"]) -> float:
 
 
 def load_spacecraft(path: str | Path) -> Spacecraft:
-    """Read a spacecraft's .toml; its mesh is looked for beside it."""
+    """Read a spacecraft's .toml.
+
+    Args:
+        path: The file; the mesh that it names is expected beside it.
+
+    Raises:
+        GknetError: The file cannot be read, is no valid TOML, or describes no spacecraft.
+    """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")

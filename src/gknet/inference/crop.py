@@ -24,6 +24,12 @@ class Crop:
     """The square [x0, x0 + side] x [y0, y0 + side] of an image, resized to `size` x `size`.
 
     It may reach beyond the image; what lies outside is black.
+
+    Attributes:
+        x0: Left side in whole px of the image.
+        y0: Top side in whole px of the image.
+        side: Length of a side in px of the image.
+        size: Length of a side in px of the network's input.
     """
 
     x0: int
@@ -37,7 +43,7 @@ class Crop:
 
     @staticmethod
     def around(box: Box, size: int, margin: float = CROP_MARGIN) -> Crop:
-        """The square about `box`, its side `margin` times the longer side of the box."""
+        """The square about `box`, its side `margin` times the longer side of the box, for an input of `size` px."""
         side = max(8, round(box.side * margin))
         centre_x, centre_y = box.centre
         return Crop(round(centre_x - side / 2), round(centre_y - side / 2), side, size)
@@ -49,17 +55,20 @@ class Crop:
 
     @property
     def input_from_image(self) -> Float[ndarray, "3 3"]:
+        """(3, 3) affine map from pixels of the image to pixels of the input."""
         s = self.scale
         return np.array([[s, 0, -s * self.x0], [0, s, -s * self.y0], [0, 0, 1]], dtype=np.float64)
 
     def to_input(self, pixels: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """(..., 2) pixels of the image, in pixels of the input."""
         return (np.asarray(pixels) - (self.x0, self.y0)) * self.scale
 
     def to_image(self, pixels: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """(..., 2) pixels of the input, in pixels of the image."""
         return np.asarray(pixels) / self.scale + (self.x0, self.y0)
 
     def cut(self, image: UInt8[ndarray, "h w c"]) -> UInt8[ndarray, "size size c"]:
-        """The crop of `image`: area-averaged when it shrinks, linear when it grows, black outside."""
+        """The (size, size, c) crop of an (h, w, c) image: area-averaged when it shrinks, linear when it grows."""
         height, width = image.shape[:2]
         x0, y0 = max(self.x0, 0), max(self.y0, 0)
         x1, y1 = min(self.x0 + self.side, width), min(self.y0 + self.side, height)

@@ -29,11 +29,17 @@ SURE_SCORE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Estimator(CropEstimator):
-    """Finds one known spacecraft by its keypoints.
+    """Finds one known spacecraft by its keypoints. `load_estimator` makes one.
 
-    keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride), channel k is keypoint k, and perhaps a
-                       belief in the attitude
-    bins               the classes of that belief; None where there is none
+    Attributes:
+        keypoint_network: (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride), channel k is keypoint k, and for some
+            networks the probabilities of the attitude classes.
+        spacecraft: The spacecraft that it finds.
+        locator: (b, 3, s, s) -> (b, 5, s / stride, s / stride); None if boxes are always given.
+        settings: Input sizes, crop refinement and test-time augmentation.
+        decoding: Scales of the keypoints' covariance.
+        pnp: Thresholds of the pose solver.
+        bins: The attitude classes; None for a network without them.
     """
 
     keypoint_network: KeypointNetwork
@@ -56,7 +62,7 @@ class Estimator(CropEstimator):
         return second if _support(second) >= _support(first) else first
 
     def detect(self, image: UInt8[ndarray, "h w 3"], crop: Crop) -> tuple[Keypoints, Float32[ndarray, " k"] | None]:
-        """The keypoints seen in a crop, in pixels of the full image, and the belief in the attitude if there is one."""
+        """The keypoints in a crop, in pixels of the full image, and the probabilities of the attitude classes, if any."""
         heatmaps, attitude = self._seen(network_input(image, crop))
         if len(heatmaps) != self.spacecraft.keypoint_count:
             raise GknetError(
@@ -159,9 +165,22 @@ def shipped_models() -> tuple[str, ...]:
 def load_estimator(
     name_or_folder: str | Path, threads: int | None = None, device: str = "cpu", tta_rotations: int = 1
 ) -> Estimator | DirectEstimator:
-    """An estimator from a shipped model's name, or from a folder with keypoints.onnx or direct.onnx.
+    """Load a model.
 
-    Where a locator.onnx is beside it, the estimator needs no box. `tta_rotations` is `InferenceSettings.tta_rotations`.
+    Args:
+        name_or_folder: The name of a shipped model, such as satellite_01, or a folder with keypoints.onnx or
+            direct.onnx. With a locator.onnx beside it the estimator needs no box.
+        threads: Threads of onnxruntime; all cores by default.
+        device: "cpu" or "cuda".
+        tta_rotations: In how many orientations (1, 2 or 4) a keypoint network sees each crop: more is more accurate and
+            takes as many times the work.
+
+    Returns:
+        An estimator by keypoints, or by direct pose regression where the folder has a direct.onnx. Both have
+        `estimate(image, camera, box=None)`.
+
+    Raises:
+        GknetError: There is no such model, or a file is damaged.
     """
     folder = Path(name_or_folder)
     if str(name_or_folder) in shipped_models():

@@ -95,7 +95,16 @@ class CropEstimator(ABC):
         """The pose of the spacecraft in the box, some of which is inside the image, or why there is none."""
 
     def estimate(self, image: UInt8[ndarray, "h w *c"], camera: Camera, box: Box | None = None) -> Estimate:
-        """The pose of the spacecraft in `image`, or why there is none. Without a `box` the locator finds it."""
+        """The pose of the spacecraft in an image, or why there is none.
+
+        Args:
+            image: (h, w, 3) RGB or (h, w) grey, uint8.
+            camera: The camera of the image.
+            box: A box in px about all keypoints, hidden ones too; None lets the locator find it.
+
+        Raises:
+            GknetError: The image is no such array or not of the camera's size, or there is neither box nor locator.
+        """
         image = check_image(image)
         if image.shape[:2] != (camera.height, camera.width):
             raise GknetError(
