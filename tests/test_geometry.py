@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
-from tests.strategies import coordinates, poses, quaternions
+from tests.strategies import cameras, coordinates, poses, quaternions
 
 DISTORTION = np.array([-0.22383, 0.51410, -0.000665, -0.000214, -0.13124])
 DISTORTED = Camera(np.array([[2988.58, 0, 960], [0, 2988.34, 600], [0, 0, 1]]), 1920, 1200, DISTORTION)
@@ -183,6 +183,8 @@ def test_distorted_camera_cannot_be_warped() -> None:
         (np.diag([-5, 5, 1]), (10, 10), "fx"),
         (np.diag([5, 5, 2]), (10, 10), "fx"),
         (np.eye(3), (0, 10), "size"),
+        (np.array([[5, 0, 2.0**31], [0, 5, 2], [0, 0, 1]]), (10, 10), "up to 1e"),
+        ([[10**400, 0, 1], [0, 1, 1], [0, 0, 1]], (10, 10), "camera matrix: expected numbers"),
     ],
 )
 def test_bad_camera_is_refused(matrix: np.ndarray, size: tuple[int, int], word: str) -> None:
@@ -191,5 +193,99 @@ def test_bad_camera_is_refused(matrix: np.ndarray, size: tuple[int, int], word: 
 
 
 def test_bad_distortion_is_refused() -> None:
-    with pytest.raises(GknetError, match="distortion"):
-        Camera(np.eye(3), 10, 10, np.zeros(4))
+    with pytest.raises(GknetError, match="distortion: a pinhole has 4, 5, 8, 12, 14 coefficients, got 3"):
+        Camera(np.eye(3), 10, 10, np.zeros(3))
+    with pytest.raises(GknetError, match="distortion: a fisheye has 4 coefficients, got 5"):
+        Camera(np.eye(3), 10, 10, np.zeros(5), "fisheye")
+    with pytest.raises(GknetError, match="distortion: expected finite"):
+        Camera(np.eye(3), 10, 10, np.array([0, 0, np.inf, 0]))
+    with pytest.raises(GknetError, match="model: expected pinhole or fisheye, got 'omni'"):
+        Camera(np.eye(3), 10, 10, np.zeros(4), "omni")  # type: ignore[arg-type]
+
+
+def rays(camera: Camera, count: int, angle_rad: float, seed: int) -> np.ndarray:
+    """Points whose rays are within an angle of the optical axis, at 0.5 to 50 m."""
+    rng = np.random.default_rng(seed)
+    angle, turn, depth = rng.uniform(0, angle_rad, count), rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 50, count)
+    return (
+        np.stack([np.tan(angle) * np.cos(turn), np.tan(angle) * np.sin(turn), np.ones(count)], axis=1) * depth[:, None]
+    )
+
+
+@given(cameras(), st.integers(0, 2**31))
+def test_project_with_jacobian_is_project_and_its_differences(camera: Camera, seed: int) -> None:
+    points = np.concatenate([rays(camera, 6, 0.6, seed), [[0, 0, 3.0]]])
+    pixels, derivative = camera.project_with_jacobian(points)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
+    step_m = 1e-6
+    for axis in range(3):
+        ahead, behind = points.copy(), points.copy()
+        ahead[:, axis] += step_m
+        behind[:, axis] -= step_m
+        expected = (camera.project(ahead) - camera.project(behind)) / (2 * step_m)
+        np.testing.assert_allclose(derivative[:, :, axis], expected, atol=1e-4 * camera.matrix[0, 0])
+
+
+def test_jacobian_is_finite_behind_the_camera_and_of_no_point() -> None:
+    behind = np.array([[0.1, 0.2, -5.0]])
+    for camera in (DISTORTED, FISHEYE):
+        pixels, derivative = camera.project_with_jacobian(behind)
+        assert np.isfinite(pixels).all()
+        assert np.isfinite(derivative).all()
+        assert camera.project_with_jacobian(np.zeros((0, 3)))[1].shape == (0, 2, 3)
+
+
+@given(cameras(), st.integers(0, 2**31))
+def test_undistort_inverts_every_lens(camera: Camera, seed: int) -> None:
+    """Within 35 degrees of the axis, where the drawn lenses are one to one."""
+    points = rays(camera, 20, 0.6, seed)
+    ideal = Camera(camera.matrix, camera.width, camera.height).project(points)
+    np.testing.assert_allclose(camera.undistort(camera.project(points)), ideal, atol=2e-3)
+
+
+FISHEYE = Camera(np.array([[500.0, 0, 640], [0, 510, 400], [0, 0, 1]]), 1280, 800, np.zeros(4), "fisheye")
+
+
+def test_a_fisheye_without_coefficients_is_equidistant() -> None:
+    """A quarter of a right angle is a quarter of the pixels that a right angle has."""
+    angles = np.radians([0, 22.5, 45, 89])
+    points = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    pixels = FISHEYE.project(points)
+    np.testing.assert_allclose(pixels, np.stack([640 + 500 * angles, 0 * angles + 400], axis=1), atol=1e-9)
+    assert FISHEYE.distorted
+    np.testing.assert_allclose(FISHEYE.undistort(pixels)[:, 0], 640 + 500 * np.tan(angles), rtol=1e-9)
+
+
+def test_a_fisheye_to_80_degrees_is_undone() -> None:
+    """OpenCV's own inverse clips the distorted angle and is wrong here."""
+    camera = Camera(FISHEYE.matrix, 1280, 800, np.array([0.1, -0.02, 0.003, 0.0004]), "fisheye")
+    points = rays(camera, 200, np.radians(85), 1)
+    ideal = Camera(camera.matrix, 1280, 800).project(points)
+    np.testing.assert_allclose(camera.undistort(camera.project(points)), ideal, rtol=1e-6)
+
+
+def test_a_ray_that_no_pinhole_camera_has_is_nan() -> None:
+    beyond = np.array([[640 + 500 * np.radians(100), 400.0], [640.0, 400.0]])
+    assert np.isnan(FISHEYE.undistort(beyond)).all(axis=1).tolist() == [True, False]
+
+
+@given(cameras(), st.integers(1, 8), st.integers(0, 2**31))
+def test_scaled_camera_sees_the_scaled_picture(camera: Camera, factor: int, seed: int) -> None:
+    width, height = camera.width * factor // 4, camera.height * factor // 4
+    points = rays(camera, 10, 0.5, seed)
+    small = camera.scaled(width, height)
+    expected = camera.project(points) * (width / camera.width, height / camera.height)
+    np.testing.assert_allclose(small.project(points), expected, atol=1e-8)
+    assert (small.width, small.height, small.model) == (width, height, camera.model)
+    back = small.scaled(camera.width, camera.height)
+    np.testing.assert_allclose(back.matrix, camera.matrix, rtol=1e-12)
+
+
+def test_a_camera_is_scaled_by_whole_pixels_but_not_cut() -> None:
+    camera = Camera.from_focal(1000, 1920, 1200)
+    assert camera.scaled(853, 533).height == 533
+    for size in ((1920, 1080), (1024, 1024), (1200, 1920)):
+        with pytest.raises(GknetError, match=f"{size[0]} x {size[1]} pixels are not 1920 x 1200 resized"):
+            camera.scaled(*size)
+    with pytest.raises(GknetError, match="size"):
+        camera.scaled(0, 5)

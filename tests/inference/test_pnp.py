@@ -18,6 +18,9 @@ CAMERA = Camera.from_focal(1400, 1024, 1024)
 DISTORTED = Camera(
     np.array([[1494.3, 0, 480], [0, 1494.2, 300], [0, 0, 1]]), 960, 600, np.array([-0.224, 0.514, -7e-4, -2e-4, -0.131])
 )
+FISHEYE = Camera(
+    np.array([[600.0, 0, 480], [0, 605, 300], [0, 0, 1]]), 960, 600, np.array([0.1, -0.02, 0.003, 0.0004]), "fisheye"
+)
 POSE = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0.8, -0.5, 15.0])
 
 
@@ -39,7 +42,7 @@ def solved(keypoints: Keypoints, camera: Camera = CAMERA, points: np.ndarray = P
     return result
 
 
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED, FISHEYE])
 @given(quaternion=quaternions())
 def test_truth_is_recovered_exactly(camera: Camera, quaternion: np.ndarray) -> None:
     """Half turns included."""
@@ -178,6 +181,15 @@ def test_strong_distortion_is_taken_out_before_the_consensus() -> None:
     )
     assert isinstance(result, PnpResult), result
     assert np.abs(pose_error_vector(pose, result.cam_from_body)).max() < 1e-5
+
+
+def test_a_fisheye_keypoint_beside_the_camera_is_left_out_of_the_consensus() -> None:
+    keypoints = detections(POSE, FISHEYE)
+    pixels = keypoints.pixels.copy()
+    pixels[5] = (480 + 600 * np.radians(100), 300)
+    result = solved(Keypoints(pixels, keypoints.score, keypoints.covariance_px2), FISHEYE)
+    assert np.abs(pose_error_vector(POSE, result.cam_from_body)).max() < 1e-4
+    assert np.flatnonzero(~result.inliers).tolist() == [5]
 
 
 def test_a_keypoint_off_by_many_of_its_sigmas_loses_its_pull() -> None:

@@ -204,9 +204,13 @@ def _solve(
 def _consensus(problem: _Problem, score: Float[ndarray, " k"], threshold_px: float) -> Pose | None:
     """LO-RANSAC on undistorted pixels, the surest keypoints first."""
     matrix = problem.camera.matrix
+    ideal = problem.camera.undistort(problem.pixels)
     order = np.argsort(-score, kind="stable")
+    order = order[np.isfinite(ideal[order]).all(axis=1)]  # a fisheye sees rays that no pinhole camera has
+    if len(order) < 4:
+        return None
     found, report = poselib.estimate_absolute_pose(
-        problem.camera.undistort(problem.pixels)[order],
+        ideal[order],
         problem.usable_m[order],
         {
             "model": "PINHOLE",
@@ -234,14 +238,11 @@ def _projected(
     """Pixels of all points, their derivative by (dw, dt): exp([dw]x) R, t + dt, and their depth in metres."""
     turned = problem.points_m @ pose.rotation.T
     placed = turned + pose.translation_m
-    pixels, derivatives = cv2.projectPoints(
-        placed, np.zeros(3), np.zeros(3), problem.camera.matrix, problem.camera.distortion
-    )
-    by_point = derivatives[:, 3:6].reshape(-1, 2, 3)
+    pixels, by_point = problem.camera.project_with_jacobian(placed)
     x, y, z = turned.T[:, :, None]
     a, b, c = by_point.transpose(2, 0, 1)
     by_turn = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=2)  # a . (dw x p) = dw . (p x a)
-    return pixels[:, 0], np.concatenate([by_turn, by_point], axis=2), placed[:, 2]
+    return pixels, np.concatenate([by_turn, by_point], axis=2), placed[:, 2]
 
 
 def _edge_errors(
