@@ -17,8 +17,9 @@ SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 LAYERS = (
     {"errors"},
     {"geometry"},
-    {"frame", "spacecraft"},
+    {"frame"},
     {"io"},
+    {"spacecraft"},
     {"dataset", "fleet", "inference"},
     {"network"},
     {"evaluation"},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -70,6 +71,14 @@ def test_unknown_command_and_option(refused: Callable[..., str]) -> None:
 def test_interrupt_is_130(monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]) -> None:
     fails_with(monkeypatch, KeyboardInterrupt())
     assert refused("doctor", code=130) == "gknet: interrupted"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_stop_signals_end_in_one_line(
+    number: int, code: int, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
+) -> None:
+    monkeypatch.setattr("gknet.cli.doctor.examine", lambda: os.kill(os.getpid(), number))
+    assert refused("doctor", code=code) == "gknet: interrupted"
 
 
 def test_full_disk_says_so(monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]) -> None:

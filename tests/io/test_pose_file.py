@@ -34,8 +34,11 @@ def test_record_holds_the_estimate() -> None:
     entry = json.loads(json.dumps(record("x", 0.5, estimate(), NAMES), allow_nan=False))
     assert (entry["name"], entry["time_s"], entry["status"], entry["failure"]) == ("x", 0.5, "ok", None)
     pose = Pose.from_quaternion(entry["quaternion_wxyz"], entry["translation_m"])
-    assert pose.angle_to(estimate().cam_from_body) < 1e-7
-    assert np.allclose(entry["covariance"], estimate().covariance)
+    truth, covariance = estimate().cam_from_body, estimate().covariance
+    assert truth is not None
+    assert covariance is not None
+    assert pose.angle_to(truth) < 1e-7
+    assert np.allclose(entry["covariance"], covariance)
     assert entry["keypoints"][0] == {
         "name": "a",
         "pixel": [1.5, 2.5],

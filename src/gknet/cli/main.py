@@ -19,11 +19,12 @@ from gknet.cli.predict import predict
 from gknet.cli.render import render
 from gknet.cli.train import export, train
 from gknet.errors import GknetError, MissingExtraError
+from gknet.io.interrupt import Interrupted, as_keyboard_interrupt
 
 _USAGE_ERROR = cast(type[typer.BadParameter], typer.BadParameter.__mro__[1])
 """What typer raises for a wrong command line: the parent of its BadParameter, which it does not export."""
 
-BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
+BAD_INPUT, INTERNAL = 2, 1
 
 _EXTRA_OF_MODULE = {
     **dict.fromkeys(("mitsuba", "drjit", "trimesh", "manifold3d", "mapbox_earcut", "shapely", "PIL"), "render"),
@@ -64,20 +65,28 @@ def _options(
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line; the exit code is 0, 2 for bad input, 130 for Ctrl-C, 1 for a fault of gknet's own.
+    """Run one command line.
 
     With GKNET_DEBUG=1 errors keep their tracebacks.
+
+    Returns:
+        The exit code: 0, 2 for bad input, 1 for a fault of gknet's own; 130 after Ctrl-C, 143 after SIGTERM, 129 after
+        SIGHUP.
     """
     debug = os.environ.get("GKNET_DEBUG", "") not in ("", "0")
+    command = typer.main.get_command(app)
     try:
-        code = app(list(arguments) or ["--help"], prog_name="gknet", standalone_mode=False)
-    except (KeyboardInterrupt, typer.Abort):
-        code = INTERRUPTED
+        with as_keyboard_interrupt(), command.make_context("gknet", list(arguments) or ["--help"]) as context:
+            command.invoke(context)
+    except typer.Exit as end:
+        return end.exit_code
+    except (KeyboardInterrupt, typer.Abort) as error:
+        return _end("interrupted", (error if isinstance(error, Interrupted) else Interrupted()).exit_code)
     except Exception as error:
         if debug and not isinstance(error, _USAGE_ERROR):
             raise
         return _end_badly(error)
-    return _end("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
+    return 0
 
 
 def _end_badly(error: Exception) -> int:

@@ -1,22 +1,87 @@
-"""Files that are either whole or absent: written under a temporary name, then renamed."""
+"""Files that are either whole or absent: written under a temporary name in their folder, then renamed.
+
+A temporary name is hidden and random, so writers on other hosts of a shared folder never meet, and what a killed writer
+left behind never stands in anybody's way.
+"""
 
 from __future__ import annotations
 
 import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+_NAME_CHARACTERS = 40
+"""Of the file's own name in a temporary one: at most 160 bytes, so a name that is legal for a file always is."""
 
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path`; a crash, or another writer of the same path, never leaves a half-written file."""
+
+@contextmanager
+def replacing(path: str | Path, keep_suffix: bool = False, keep_on_error: bool = False) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place when the `with` block ends.
+
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
+
+    Args:
+        path: The file to write. Its folder exists; a file of that name is replaced.
+        keep_suffix: End the temporary name as `path` ends, for writers that choose a format by the suffix.
+        keep_on_error: Rename the file too when the block ends with an exception. Without it the file is removed then.
+
+    Yields:
+        The path of an empty file with the permissions that the process's umask gives.
+
+    Raises:
+        OSError: The file cannot be made or renamed. The error names `path`, not the temporary file.
+    """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    ending = path.suffix if keep_suffix else ""
+    temporary = path.with_name(f".{path.name[:_NAME_CHARACTERS]}.{secrets.token_hex(8)}.tmp{ending}")
+    with naming(path):
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
+        with naming(path, temporary):
+            yield temporary
+    except BaseException:
+        if keep_on_error:
+            _rename(temporary, path)
+        else:
+            temporary.unlink(missing_ok=True)
+        raise
+    _rename(temporary, path)
+
+
+def _rename(temporary: Path, path: Path) -> None:
+    try:
+        with naming(path):
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
+@contextmanager
+def naming(path: str | Path, instead_of: Path | None = None) -> Iterator[None]:
+    """An OSError in the `with` block that names no file names `path`; one of `instead_of` names `path` instead."""
+    try:
+        yield
+    except OSError as error:
+        unnamed = error.filename is None or instead_of is None or Path(os.fsdecode(error.filename)) == instead_of
+        if error.errno is None or not unnamed:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write `data` to `path`; a crash, or another writer of the same path, never leaves a half-written file.
+
+    Raises:
+        OSError: It cannot be written; the error names `path`.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def write_text(path: str | Path, text: str) -> None:
-    write_bytes(path, text.encode("utf-8"))
+    """Write `text` as UTF-8, see `write_bytes`. What UTF-8 lacks (lone surrogates) becomes a backslash escape."""
+    write_bytes(path, text.encode("utf-8", errors="backslashreplace"))
