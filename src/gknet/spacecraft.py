@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -14,9 +12,11 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from gknet.errors import GknetError
+from gknet.io.atomic import write_text
+from gknet.io.text import parse_toml, read_text, validated
 
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 
@@ -131,16 +131,12 @@ def load_spacecraft(path: str | Path) -> Spacecraft:
         GknetError: The file cannot be read, is no valid TOML, or describes no spacecraft.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise GknetError(f"{path}: cannot read the spacecraft file ({error})") from error
-    return spacecraft_from_toml(text, str(path), path.parent)
+    return spacecraft_from_toml(read_text(path), str(path), path.parent)
 
 
 def spacecraft_from_toml(text: str, source: str, folder: Path | None = None) -> Spacecraft:
     """Parse the text of a spacecraft's .toml. Errors name `source`; without a mesh's `folder` there is no mesh."""
-    file = _parse(text, source)
+    file: _File = validated(_File, parse_toml(text, source), source)
     index = {keypoint.name: k for k, keypoint in enumerate(file.keypoint)}
     for edge in file.edges:
         for end in edge:
@@ -159,17 +155,6 @@ def spacecraft_from_toml(text: str, source: str, folder: Path | None = None) -> 
         )
     except GknetError as error:
         raise GknetError(f"{source}: {error}") from error
-
-
-def _parse(text: str, source: str) -> _File:
-    try:
-        return _File.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise GknetError(f"{source}: not valid TOML: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise GknetError(f"{source}: {place}: {first['msg']}") from error
 
 
 def _quoted(text: str) -> str:
@@ -198,7 +183,4 @@ def spacecraft_toml(spacecraft: Spacecraft) -> str:
 
 
 def save_spacecraft(spacecraft: Spacecraft, path: str | Path) -> None:
-    path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(spacecraft_toml(spacecraft), encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, spacecraft_toml(spacecraft))

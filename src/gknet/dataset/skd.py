@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera
 from gknet.io.image import read_image
+from gknet.io.text import read_json
 from gknet.spacecraft import Spacecraft, load_spacecraft
 
 SAME_POINT_M = 1e-3
@@ -177,10 +177,7 @@ def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
 
 
 def _read_split(path: Path) -> list[tuple[str, str]]:
-    try:
-        listing = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise GknetError(f"{path}: cannot read the split file ({error})") from error
+    listing = read_json(path)
     lists = listing.values() if isinstance(listing, dict) else [None]
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
         raise GknetError(f'{path}: expected {{"Satellite_01": ["data/000001", ...], ...}}, got something else')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import json
+import io
 import operator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_points
 from gknet.errors import GknetError
+from gknet.io.text import read_json, read_text
 from gknet.io.text_table import read_skd_camera_matrix, read_table
 from gknet.io.torch_file import load_torch_file
 
@@ -61,12 +62,11 @@ def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
 
 def read_rows(path: Path) -> tuple[dict[str, str], ...]:
     """The rows of an annotations.csv as text, each with the authors' columns at least."""
+    reader = csv.DictReader(io.StringIO(read_text(path), newline=""), skipinitialspace=True)
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            rows = tuple(reader)
-            columns = reader.fieldnames or []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = tuple(reader)
+        columns = reader.fieldnames or []
+    except csv.Error as error:
         raise GknetError(f"{path}: cannot read the annotations ({error})") from error
     missing = [column for column in AUTHORS_COLUMNS if column not in columns]
     if missing:
@@ -106,10 +106,10 @@ def read_skeleton(folder: Path, keypoint_count: int) -> Skeleton:
 
 
 def _read_json_skeleton(path: Path, keypoint_count: int) -> Skeleton:
+    content = read_json(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         names, edges = tuple(content["keypoint_names"]), content["edges"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (KeyError, TypeError) as error:
         raise GknetError(f"{path}: expected the keys keypoint_names and edges ({error!r})") from error
     if len(names) != keypoint_count or not all(isinstance(name, str) for name in names):
         raise GknetError(f"{path}: expected {keypoint_count} keypoint names as in keypoints.txt, got {len(names)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +16,7 @@ from trimesh.visual import TextureVisuals
 
 from gknet.fleet.materials import Material
 from gknet.fleet.shapes import Point, joined, point_of
+from gknet.io.atomic import write_bytes
 from gknet.spacecraft import Spacecraft, Symmetry, diameter, save_spacecraft
 
 CREASE_RAD = np.deg2rad(35)
@@ -88,9 +88,7 @@ class Model:
         """Write <folder>/<name>.glb and .toml."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.name}.glb"
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_bytes(self.scene().export(file_type="glb", include_normals=True))
-        os.replace(temporary, path)
+        write_bytes(path, self.scene().export(file_type="glb", include_normals=True))
         spacecraft = self.spacecraft(path)
         save_spacecraft(spacecraft, path.with_suffix(".toml"))
         return spacecraft

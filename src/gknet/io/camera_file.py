@@ -5,7 +5,6 @@ SPEED+ puts its principal point at half the image's size, which is the image's c
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy import ndarray
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera
+from gknet.io.text import read_json
 from gknet.io.text_table import read_skd_camera_matrix, read_table
 
 _OURS = {"matrix", "width", "height", "distortion"}
@@ -100,12 +100,7 @@ def _numbers(source: object, name: str, values: object, shape: tuple[int, ...]) 
 
 
 def _from_json(path: Path) -> Camera:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise GknetError(f"{path}: not valid JSON: {error}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise GknetError(f"{path}: cannot read the camera file ({error})") from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise GknetError(f"{path}: expected a JSON object with a camera, got {type(content).__name__}")
     if "cameraMatrix" in content:

@@ -9,14 +9,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gknet.errors import GknetError
+from gknet.io.text import quoted, read_text
 
 
 def read_table(path: Path) -> Float[ndarray, "n 3"]:
     """Rows of three finite numbers, separated by commas or spaces."""
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise GknetError(f"{path}: cannot read the table ({error})") from error
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
     if not lines:
         raise GknetError(f"{path}: expected rows of three numbers, found none")
     table = np.empty((len(lines), 3))
@@ -24,9 +22,9 @@ def read_table(path: Path) -> Float[ndarray, "n 3"]:
         try:
             values = [float(cell) for cell in line.replace(",", " ").split()]
         except ValueError as error:
-            raise GknetError(f"{path}: row {number}: expected three numbers, got {line.strip()!r}") from error
+            raise GknetError(f"{path}: row {number}: expected three numbers, got {quoted(line.strip())}") from error
         if len(values) != 3 or not np.isfinite(values).all():
-            raise GknetError(f"{path}: row {number}: expected three finite numbers, got {line.strip()!r}")
+            raise GknetError(f"{path}: row {number}: expected three finite numbers, got {quoted(line.strip())}")
         table[number - 1] = values
     return table
 

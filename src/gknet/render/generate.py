@@ -24,6 +24,7 @@ from gknet.geometry import Camera
 from gknet.inference.crop import Crop
 from gknet.io.atomic import write_text
 from gknet.io.image import is_whole_jpeg
+from gknet.io.text import read_json
 from gknet.render.contact_sheet import write_contact_sheet
 from gknet.render.plan import (
     DEFAULT_SIZE,
@@ -135,10 +136,7 @@ def _claim(root: Path, options: Options) -> None:
         if (root / "data").exists():
             raise GknetError(f"{root}: it holds data that this renderer did not make; choose another folder")
         write_text(path, json.dumps(mine, indent=1) + "\n")
-    try:
-        theirs = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise GknetError(f"{path}: not valid JSON ({error}); choose another folder") from error
+    theirs = read_json(path)
     for key, want in mine.items():
         have = theirs.get(key) if isinstance(theirs, dict) else None
         if have != want:

@@ -6,14 +6,14 @@ anywhere and still be the same part.
 
 from __future__ import annotations
 
-import tomllib
 import zlib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from gknet.errors import GknetError
+from gknet.io.text import read_toml, validated
 
 Split = Literal["train", "val", "test"]
 SPLIT_CYCLE: tuple[Split, ...] = ("train", "val", "train", "test", "train")
@@ -130,17 +130,10 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
     """A recipe by the name of one that ships ("skd", "skd-hard"), or from a TOML file."""
     shipped = _FOLDER / f"{name_or_path}.toml"
     path = shipped if shipped.parent == _FOLDER and shipped.is_file() else Path(name_or_path)
-    try:
-        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError) as error:
+    if not path.exists():
         known = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.toml")))
-        raise GknetError(f"recipe {name_or_path}: expected one of {known}, or a TOML file ({error})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise GknetError(f"{path}: not valid TOML: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise GknetError(f"{path}: {place}: {first['msg']}") from error
+        raise GknetError(f"recipe {name_or_path}: expected one of {known}, or a TOML file")
+    return validated(Recipe, read_toml(path), path)
 
 
 RECIPES: dict[str, Recipe] = {name: load_recipe(name) for name in ("skd", "skd-hard")}
