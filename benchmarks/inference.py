@@ -101,11 +101,11 @@ def write_paper_network(path: Path) -> None:
     import onnx
     import torch
 
-    from gknet.network.build import gknet_paper
+    from gknet.network.build import build
     from gknet.training.export import folded, onnx_graph
 
     chain = np.eye(16, dtype=bool) | np.eye(16, k=1, dtype=bool) | np.eye(16, k=-1, dtype=bool)
-    onnx.save(onnx_graph(folded(gknet_paper(chain)), torch.zeros(2, 3, 256, 256)), path)
+    onnx.save(onnx_graph(folded(build("gknet-paper", chain, np.zeros((16, 3)))), torch.zeros(2, 3, 256, 256)), path)
 
 
 def paper_ms(path: Path, threads: int, runs: int) -> float:

@@ -13,25 +13,13 @@ from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.inference.attitude import AttitudeBins  # noqa: E402
 from gknet.network.backbone import position_encoding  # noqa: E402
-from gknet.network.build import (  # noqa: E402
-    GRAPH_NETWORKS,
-    build,
-    dmanet,
-    dmanet_xs,
-    gknet_paper,
-    gknet_s,
-    gknet_xs,
-    hrnet,
-    hrnet_xs,
-    locator,
-    resunet,
-    resunet_xs,
-)
+from gknet.network.build import NETWORKS, build  # noqa: E402
 from gknet.network.dmanet import DMANet, DMANetConfig, MultiScaleAttention  # noqa: E402
 from gknet.network.gknet import GKNetConfig  # noqa: E402
 from gknet.network.graph import normalised_adjacency  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS, expected_heatmaps, log_probability  # noqa: E402
 from gknet.network.hrnet import HRNet, HRNetConfig  # noqa: E402
+from gknet.network.network import Network  # noqa: E402
 from gknet.network.resunet import ResUNet, ResUNetConfig  # noqa: E402
 from gknet.training.loss import gaussian_targets  # noqa: E402
 from tests.network.tiny import chain, points, tiny  # noqa: E402
@@ -39,6 +27,10 @@ from tests.network.tiny import chain, points, tiny  # noqa: E402
 
 def parameters(network: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
+
+
+def named(name: str, graph: str = "skeleton") -> Network:
+    return build(name, chain(16), points(16), graph)
 
 
 @pytest.mark.parametrize("count", [4, 13, 24])
@@ -68,12 +60,12 @@ def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
 
 def test_without_edges_the_size_is_the_same() -> None:
     assert parameters(tiny(9, "identity")) == parameters(tiny(9, "skeleton")) == parameters(tiny(9, "random"))
-    for network in (gknet_s, gknet_xs):
-        whole, without = (parameters(network(chain(16), points(16), graph)) for graph in ("skeleton", "none"))
+    for name in ("gknet-s", "gknet-xs"):
+        whole, without = (parameters(named(name, graph)) for graph in ("skeleton", "none"))
         assert abs(without / whole - 1) < 0.03
 
 
-@pytest.mark.parametrize("name", GRAPH_NETWORKS)
+@pytest.mark.parametrize("name", [name for name, spec in NETWORKS.items() if spec.has_graph])
 def test_a_named_network_has_the_graph_that_was_asked_for(name: str) -> None:
     skeleton = chain(5)
     for graph in ("skeleton", "identity", "random"):
@@ -137,7 +129,9 @@ def test_dmanet_tells_a_pose_at_any_input_size() -> None:
     network.eval()
     images = torch.rand(3, 3, 64, 64)
     torch.testing.assert_close(network(images)[1:2], network(images[1:2]), atol=1e-5, rtol=1e-4)
-    assert dmanet_xs()(torch.rand(2, 3, 64, 64)).shape == (2, 3 + AttitudeBins(dmanet_xs().config.bins).count)
+    named_one = named("dmanet-xs")
+    assert named_one.attitude_bins is not None
+    assert named_one(torch.rand(2, 3, 64, 64)).shape == (2, 3 + AttitudeBins(named_one.attitude_bins).count)
 
 
 def test_gradients_reach_every_parameter_of_dmanet() -> None:
@@ -179,19 +173,25 @@ def multiply_accumulates(network: torch.nn.Module) -> float:
 
 
 def test_the_methods_cost_the_same_to_run() -> None:
-    ours = multiply_accumulates(gknet_xs(chain(16), points(16)))
-    for other in (hrnet_xs(16), resunet_xs(16), dmanet_xs()):
-        assert abs(multiply_accumulates(other) / ours - 1) < 0.05
+    ours = multiply_accumulates(named("gknet-xs"))
+    for other in ("hrnet-xs", "resunet-xs", "dmanet-xs"):
+        assert abs(multiply_accumulates(named(other)) / ours - 1) < 0.05
 
 
-def test_named_sizes() -> None:
-    assert 2e6 < parameters(gknet_s(chain(16), points(16))) < 3.7e6
-    assert 0.8e6 < parameters(gknet_xs(chain(16), points(16))) < 1.1e6
-    assert 80e6 < parameters(gknet_paper(chain(16))) < 100e6
-    assert 28e6 < parameters(hrnet(16)) < 30e6
-    assert 23e6 < parameters(resunet(16)) < 26e6
-    assert 25e6 < parameters(dmanet()) < 30e6
-    assert 0.5e6 < parameters(locator()) < 0.8e6
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("gknet-s", 2e6, 3.7e6),
+        ("gknet-xs", 0.8e6, 1.1e6),
+        ("gknet-paper", 80e6, 100e6),
+        ("hrnet", 28e6, 30e6),
+        ("resunet", 23e6, 26e6),
+        ("dmanet", 25e6, 30e6),
+        ("locator", 0.5e6, 0.8e6),
+    ],
+)
+def test_named_sizes(name: str, low: float, high: float) -> None:
+    assert low < parameters(named(name)) < high
 
 
 def test_the_code_of_a_place_is_the_same_at_every_resolution() -> None:
@@ -200,7 +200,7 @@ def test_the_code_of_a_place_is_the_same_at_every_resolution() -> None:
 
 
 def test_the_locator_speaks_of_probabilities_and_lengths() -> None:
-    output = locator()(torch.rand(2, 3, 256, 256))
+    output = named("locator")(torch.rand(2, 3, 256, 256))
     assert output.shape == (2, 5, 64, 64)
     assert (output >= 0).all()
     assert (output[:, 0] <= 1).all()

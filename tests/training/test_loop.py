@@ -114,10 +114,9 @@ def test_a_run_is_not_overwritten_and_not_confused(data: Path, finished: Path, t
 
 
 def test_a_warm_start_takes_what_fits(finished: Path) -> None:
-    from gknet.network.build import gknet_s
     from gknet.training.checkpoint import warm_start
 
-    other = gknet_s(np.eye(5, dtype=bool), np.eye(5, 3))
+    other = build("gknet-s", np.eye(5, dtype=bool), np.eye(5, 3))
     queries = other.decoder.queries.clone()
     taken, total = warm_start(other, finished / BEST)
     assert 0.9 * total < taken < total

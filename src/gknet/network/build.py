@@ -1,120 +1,150 @@
-"""The named networks, each constructor spelled out."""
+"""The list of networks: each is one file in this folder, one builder and one entry of NETWORKS.
+
+Builders import what they build, so that reading the list loads no torch.
+"""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.network.dmanet import DMANet, DMANetConfig
-from gknet.network.gknet import GKNet, GKNetConfig
-from gknet.network.gknet_paper import GKNetPaper, GKNetPaperConfig
-from gknet.network.heatmap import HeatmapNetwork
-from gknet.network.hrnet import HRNet, HRNetConfig
-from gknet.network.locator import Locator, LocatorConfig
-from gknet.network.resunet import ResUNet, ResUNetConfig
+from gknet.network.spec import NetworkOptions, NetworkSpec, Stage, checked_graph, checked_loss
 
-Network = HeatmapNetwork | DMANet | Locator
-NETWORKS = (
-    "gknet-s",
-    "gknet-paper",
-    "hrnet",
-    "resunet",
-    "dmanet",
-    "gknet-xs",
-    "hrnet-xs",
-    "resunet-xs",
-    "dmanet-xs",
-    "locator",
-)
-GRAPH_NETWORKS = ("gknet-s", "gknet-paper", "gknet-xs")
-"""Those that have a graph to choose."""
-OWN_LOSS_NETWORKS = ("dmanet", "dmanet-xs", "locator")
-"""Those that have no heatmaps, and a loss of their own."""
+if TYPE_CHECKING:
+    from gknet.network.dmanet import DMANet
+    from gknet.network.gknet import GKNet
+    from gknet.network.gknet_paper import GKNetPaper
+    from gknet.network.hrnet import HRNet
+    from gknet.network.locator import Locator
+    from gknet.network.network import Network
+    from gknet.network.resunet import ResUNet
 
 PAPER_STRIDE = 8
 """The paper holds every method to heatmaps of 32x32 at 256x256."""
 
+SMALL_FIRST = (Stage(0.4, 128, 32), Stage(0.3, 192, 32), Stage(0.3, 256, 32))
+"""Small images first: most of what there is to learn is learnt there, at a quarter of the cost."""
 
-def gknet_s(
-    adjacency: Bool[ndarray, "n n"],
-    points_m: Float[ndarray, "n 3"],
-    graph: str = "skeleton",
-    loss: str = "likelihood",
-) -> GKNet:
+PAPER_STAGES = (Stage(1.0, 256, 16),)
+LOCATOR_STAGES = (Stage(0.4, 128, 32), Stage(0.6, 256, 32))
+
+
+def gknet_s(options: NetworkOptions) -> GKNet:
     """The one that ships: 3.6 M parameters and 0.9 GMAC at 256, 256 -> 64x64.
 
     Without its graph branch it is widened to the same parameters, so that the ablation is one of the graph.
     """
-    width = 34 if graph == "none" else 32
-    config = GKNetConfig(width=width, pyramid_width=48, node_width=128, node_layers=3, heads=4, bins=12, graph=graph)
-    return GKNet(config, adjacency, points_m, loss)
+    from gknet.network.gknet import GKNet, GKNetConfig
+
+    width = 34 if options.graph == "none" else 32
+    config = GKNetConfig(
+        width=width, pyramid_width=48, node_width=128, node_layers=3, heads=4, bins=12, graph=options.graph
+    )
+    return GKNet(config, options.adjacency, options.points_m, options.loss)
 
 
-def gknet_xs(
-    adjacency: Bool[ndarray, "n n"],
-    points_m: Float[ndarray, "n 3"],
-    graph: str = "skeleton",
-    loss: str = "likelihood",
-) -> GKNet:
+def gknet_xs(options: NetworkOptions) -> GKNet:
     """The one to compare methods with on a CPU: 1.0 M parameters and 0.26 GMAC at 256, 256 -> 64x64.
 
     Without its graph branch it is widened as `gknet_s` is.
     """
-    width, pyramid_width = (17, 32) if graph == "none" else (16, 24)
-    config = GKNetConfig(width, pyramid_width, node_width=64, node_layers=3, heads=4, bins=12, graph=graph)
-    return GKNet(config, adjacency, points_m, loss)
+    from gknet.network.gknet import GKNet, GKNetConfig
+
+    width, pyramid_width = (17, 32) if options.graph == "none" else (16, 24)
+    config = GKNetConfig(width, pyramid_width, node_width=64, node_layers=3, heads=4, bins=12, graph=options.graph)
+    return GKNet(config, options.adjacency, options.points_m, options.loss)
 
 
-def gknet_paper(adjacency: Bool[ndarray, "n n"], graph: str = "skeleton", loss: str = "squared") -> GKNetPaper:
+def gknet_paper(options: NetworkOptions) -> GKNetPaper:
     """The paper's own sizes: 89 M parameters and 64 GMAC, 256 -> 32x32."""
-    config = GKNetPaperConfig(base=64, node_width=512, node_hidden=2048, node_layers=3, heads=8, graph=graph)
-    return GKNetPaper(config, adjacency, loss)
+    from gknet.network.gknet_paper import GKNetPaper, GKNetPaperConfig
+
+    config = GKNetPaperConfig(base=64, node_width=512, node_hidden=2048, node_layers=3, heads=8, graph=options.graph)
+    return GKNetPaper(config, options.adjacency, options.loss)
 
 
-def hrnet(keypoints: int, loss: str = "squared") -> HRNet:
+def hrnet(options: NetworkOptions) -> HRNet:
     """HRNet-W32: 28.6 M parameters and 10 GMAC, held to 32x32 as in the paper."""
+    from gknet.network.hrnet import HRNet, HRNetConfig
+
     config = HRNetConfig(width=32, stem_width=64, bottlenecks=4, modules=(1, 4, 3), blocks=4)
-    return HRNet(config, keypoints, loss, PAPER_STRIDE)
+    return HRNet(config, options.keypoint_count, options.loss, PAPER_STRIDE)
 
 
-def hrnet_xs(keypoints: int, loss: str = "likelihood") -> HRNet:
+def hrnet_xs(options: NetworkOptions) -> HRNet:
     """The shape of its authors' HRNet-Small-v2 at the cost of gknet-xs, 256 -> 64x64.
 
     W32's depth would leave 5 channels to the finest branch, and take twice as long to train.
     """
+    from gknet.network.hrnet import HRNet, HRNetConfig
+
     config = HRNetConfig(width=8, stem_width=12, bottlenecks=2, modules=(1, 3, 2), blocks=2)
-    return HRNet(config, keypoints, loss)
+    return HRNet(config, options.keypoint_count, options.loss)
 
 
-def resunet(keypoints: int, loss: str = "squared") -> ResUNet:
+def resunet(options: NetworkOptions) -> ResUNet:
     """ResNet-34 U-Net: 24 M parameters and 6 GMAC, held to 32x32 as in the paper."""
-    return ResUNet(ResUNetConfig(width=64, blocks=(3, 4, 6, 3)), keypoints, loss, PAPER_STRIDE)
+    from gknet.network.resunet import ResUNet, ResUNetConfig
+
+    config = ResUNetConfig(width=64, blocks=(3, 4, 6, 3))
+    return ResUNet(config, options.keypoint_count, options.loss, PAPER_STRIDE)
 
 
-def resunet_xs(keypoints: int, loss: str = "likelihood") -> ResUNet:
+def resunet_xs(options: NetworkOptions) -> ResUNet:
     """ResUNet's shape at the cost of gknet-xs, 256 -> 64x64."""
-    return ResUNet(ResUNetConfig(width=12, blocks=(3, 4, 6, 3)), keypoints, loss)
+    from gknet.network.resunet import ResUNet, ResUNetConfig
+
+    return ResUNet(ResUNetConfig(width=12, blocks=(3, 4, 6, 3)), options.keypoint_count, options.loss)
 
 
-def dmanet() -> DMANet:
+def dmanet(options: NetworkOptions) -> DMANet:
     """27.7 M parameters and 4.2 GMAC, about the encoder of other direct methods (ResNet-50); its own are not known."""
+    from gknet.network.dmanet import DMANet, DMANetConfig
+
     return DMANet(DMANetConfig((64, 128, 256, 512), (64, 128, 256, 384), (3, 4, 6, 3), head=1024))
 
 
-def dmanet_xs() -> DMANet:
+def dmanet_xs(options: NetworkOptions) -> DMANet:
     """DMANet's shape at the cost of gknet-xs."""
+    from gknet.network.dmanet import DMANet, DMANetConfig
+
     return DMANet(DMANetConfig((22, 44, 88, 176), (9, 15, 30, 60), (2, 3, 5, 4), head=192))
 
 
-def locator() -> Locator:
-    """0.7 M parameters, the whole picture at 256x256 -> 64x64 cells."""
+def locator(options: NetworkOptions) -> Locator:
+    """0.7 M parameters, the whole image at 256x256 -> 64x64 cells."""
+    from gknet.network.locator import Locator, LocatorConfig
+
     return Locator(LocatorConfig(width=16, pyramid_width=32))
 
 
-def default_loss(name: str) -> str:
-    """The small networks learn a likelihood, those of the paper's sizes its squared error."""
-    return "squared" if name in ("gknet-paper", "hrnet", "resunet") else "likelihood"
+NETWORKS: dict[str, NetworkSpec] = {
+    "gknet-s": NetworkSpec("keypoints", gknet_s, SMALL_FIRST, "likelihood", has_graph=True),
+    "gknet-xs": NetworkSpec("keypoints", gknet_xs, SMALL_FIRST, "likelihood", has_graph=True),
+    "hrnet-xs": NetworkSpec("keypoints", hrnet_xs, SMALL_FIRST, "likelihood"),
+    "resunet-xs": NetworkSpec("keypoints", resunet_xs, SMALL_FIRST, "likelihood"),
+    "dmanet-xs": NetworkSpec("direct", dmanet_xs, SMALL_FIRST),
+    "gknet-paper": NetworkSpec("keypoints", gknet_paper, PAPER_STAGES, "squared", has_graph=True),
+    "hrnet": NetworkSpec("keypoints", hrnet, PAPER_STAGES, "squared"),
+    "resunet": NetworkSpec("keypoints", resunet, PAPER_STAGES, "squared"),
+    "dmanet": NetworkSpec("direct", dmanet, PAPER_STAGES),
+    "locator": NetworkSpec("locator", locator, LOCATOR_STAGES),
+}
+"""Every network that can be trained, by the name that `gknet train --network` takes."""
+
+
+def spec_of(name: str) -> NetworkSpec:
+    """The entry of NETWORKS.
+
+    Raises:
+        GknetError: There is no network of that name.
+    """
+    if name not in NETWORKS:
+        raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{name}'")
+    return NETWORKS[name]
 
 
 def build(
@@ -124,28 +154,26 @@ def build(
     graph: str = "skeleton",
     loss: str | None = None,
 ) -> Network:
-    """The network called `name`; `loss` None is its own. Only GKNet has a use for the graph and for where the keypoints
-    are on the spacecraft, and heatmaps for the loss."""
-    loss = default_loss(name) if loss is None else loss
-    match name:
-        case "gknet-s":
-            return gknet_s(adjacency, points_m, graph, loss)
-        case "gknet-xs":
-            return gknet_xs(adjacency, points_m, graph, loss)
-        case "gknet-paper":
-            return gknet_paper(adjacency, graph, loss)
-        case "hrnet":
-            return hrnet(len(adjacency), loss)
-        case "hrnet-xs":
-            return hrnet_xs(len(adjacency), loss)
-        case "resunet":
-            return resunet(len(adjacency), loss)
-        case "resunet-xs":
-            return resunet_xs(len(adjacency), loss)
-        case "dmanet":
-            return dmanet()
-        case "dmanet-xs":
-            return dmanet_xs()
-        case "locator":
-            return locator()
-    raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{name}'")
+    """The network called `name`, with fresh weights.
+
+    Args:
+        name: A key of NETWORKS.
+        adjacency: (n, n), True where two keypoints share an edge of the skeleton, and on the diagonal.
+        points_m: (n, 3) keypoints in metres, in the body frame.
+        graph: Edges of the graph branch; of no effect on a network without one.
+        loss: Of a keypoint network; None is its own.
+
+    Raises:
+        GknetError: There is no such network, graph or loss.
+    """
+    spec = spec_of(name)
+    chosen = checked_loss(loss or spec.loss or "likelihood")
+    return spec.builder(NetworkOptions(adjacency, points_m, checked_graph(graph), chosen))
+
+
+GRAPH_NETWORKS = tuple(name for name, spec in NETWORKS.items() if spec.has_graph)
+OWN_LOSS_NETWORKS = tuple(name for name, spec in NETWORKS.items() if spec.loss is None)
+
+
+def default_loss(name: str) -> str:
+    return spec_of(name).loss or "likelihood"

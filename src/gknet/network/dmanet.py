@@ -22,6 +22,7 @@ from torch.nn import functional
 from gknet.errors import GknetError
 from gknet.network.attitude_prior import AttitudeHead
 from gknet.network.backbone import POSITION_WIDTH, ConvNorm, ResidualBlock, check_input, normalised, position_encoding
+from gknet.network.network import Network
 
 KERNELS = (3, 5, 7)
 """Sides of the depthwise convolutions that look side by side in an MAB: the scales."""
@@ -102,14 +103,13 @@ class Branches(NamedTuple):
     attitude: Tensor
 
 
-class DMANet(nn.Module):
+class DMANet(Network):
     """Image -> (b, 3 + k): offset x and y, log_depth, and the belief in each of k cells of attitude, summing to 1."""
-
-    input_size = 256
 
     def __init__(self, config: DMANetConfig) -> None:
         super().__init__()
         self.config = config
+        self.attitude_bins = config.bins
         inputs = config.width[0]
         self.stem = nn.Sequential(ConvNorm(3, inputs, 7, 2), nn.MaxPool2d(3, 2, 1))
         self.levels = nn.ModuleList()
@@ -143,7 +143,7 @@ class DMANet(nn.Module):
         weight = votes[:, :1].flatten(2).softmax(dim=2)
         return (weight * (centres + votes[:, 1:]).flatten(2)).sum(dim=2)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c"]:
+    def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         """RGB in 0 to 1 -> what `gknet.inference.direct_estimator.decode_output` reads."""
         offset, log_depth, attitude = self.branches(image)
-        return torch.cat([offset, log_depth[:, None], functional.softmax(attitude, dim=1)], dim=1)
+        return (torch.cat([offset, log_depth[:, None], functional.softmax(attitude, dim=1)], dim=1),)

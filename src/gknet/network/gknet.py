@@ -24,8 +24,9 @@ from gknet.network.backbone import (
     fourier_encoding,
     position_encoding,
 )
-from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
+from gknet.network.graph import Fusion, GraphDecoder, normalised_adjacency
 from gknet.network.heatmap import SHARPNESS, Branches, HeatmapNetwork, KeypointPrompts, log_probability
+from gknet.network.spec import checked_graph
 
 CONVICTION = 4
 """Power to which the first look's belief is raised before the second: whoever is in two minds takes a side."""

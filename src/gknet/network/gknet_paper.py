@@ -20,8 +20,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gknet.network.backbone import POSITION_WIDTH, ConvNorm, check_input, normalised, position_encoding
-from gknet.network.graph import Fusion, GraphDecoder, checked_graph, normalised_adjacency
+from gknet.network.graph import Fusion, GraphDecoder, normalised_adjacency
 from gknet.network.heatmap import Branches, HeatmapNetwork
+from gknet.network.spec import checked_graph
+
+PAPER_INPUT = 256
+"""Side of the input in pixels, for which a node's output is its map, cell by cell; other inputs resize it."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class GKNetPaper(HeatmapNetwork):
             self.cells = nn.Conv2d(widths[-1], width, 1)
             self.position = nn.Linear(POSITION_WIDTH, width)
             self.decoder = GraphDecoder(edges, width, config.node_hidden, config.heads, config.node_layers)
-            self.map_side = self.input_size // self.stride
+            self.map_side = PAPER_INPUT // self.stride
             self.node_map = nn.Linear(width, self.map_side**2)
             nn.init.normal_(self.node_map.weight, std=1e-4)
             self.fusion = Fusion(keypoints)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -14,14 +13,7 @@ from torch.nn import functional
 
 from gknet.errors import GknetError
 from gknet.network.backbone import POSITION_WIDTH, Attention
-
-Graph = Literal["skeleton", "identity", "random", "none"]
-
-
-def checked_graph(graph: str) -> Graph:
-    if graph not in get_args(Graph):
-        raise GknetError(f"graph: expected one of {', '.join(get_args(Graph))}, got '{graph}'")
-    return graph  # type: ignore[return-value]
+from gknet.network.spec import Graph
 
 
 def normalised_adjacency(adjacency: Bool[ndarray, "n n"], graph: Graph = "skeleton") -> Float[Tensor, "n n"]:

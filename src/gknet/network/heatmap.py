@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from typing import Literal, NamedTuple, get_args
+from abc import abstractmethod
+from typing import NamedTuple
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from gknet.errors import GknetError
+from gknet.network.network import Network
+from gknet.network.spec import checked_loss
 
 SIGMA_CELLS = 1.5
 """Standard deviation of the target Gaussians, in heatmap cells."""
@@ -19,14 +21,6 @@ SHARPNESS = 10.0
 
 STRIDES = (4, 8)
 """Input pixels per cell: 64x64 or, as in the paper, 32x32 heatmaps of a 256x256 input."""
-
-Loss = Literal["likelihood", "squared"]
-
-
-def checked_loss(loss: str) -> Loss:
-    if loss not in get_args(Loss):
-        raise GknetError(f"loss: expected one of {', '.join(get_args(Loss))}, got '{loss}'")
-    return loss  # type: ignore[return-value]
 
 
 def log_probability(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
@@ -66,7 +60,7 @@ class KeypointPrompts(NamedTuple):
     told: Tensor
 
 
-class HeatmapNetwork(nn.Module, ABC):
+class HeatmapNetwork(Network):
     """Image -> one heatmap per keypoint, peak near 1; channel k is keypoint k.
 
     loss    "likelihood": the maps are logits of where the keypoint is (decision 0007); "squared": they are heatmaps
@@ -74,11 +68,8 @@ class HeatmapNetwork(nn.Module, ABC):
     """
 
     stride: int
-    input_size = 256
     two_pass = False
     """Whether `branches` takes prompts, as GKNet's does."""
-    attitude_bins: int | None = None
-    """Cells to a turn of a belief in the attitude; None without one."""
 
     def __init__(self, loss: str, stride: int) -> None:
         super().__init__()
@@ -89,10 +80,6 @@ class HeatmapNetwork(nn.Module, ABC):
     @abstractmethod
     def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
         """The maps and what each branch contributed, for a loss on all of them."""
-
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b n hs ws"]:
-        """RGB in 0 to 1 -> heatmaps."""
-        return self.predict(image)[0]
 
     def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         """Heatmaps (b, n, hs, ws) and, of a network that has one, its belief in the attitude's classes (b, k)."""

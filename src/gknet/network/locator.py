@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from gknet.errors import GknetError
 from gknet.network.backbone import Encoder, Pyramid, check_input
+from gknet.network.network import Network
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,11 @@ class LocatorConfig:
             raise GknetError(f"locator: expected positive widths, got {self.width} and {self.pyramid_width}")
 
 
-class Locator(nn.Module):
+class Locator(Network):
     """Image -> (b, 5, h/4, w/4): the centre's heatmap in 0 to 1, then the distances from a cell's centre to the
     box's left, top, right and bottom sides in units of the input's size."""
 
     stride = 4
-    input_size = 256
 
     def __init__(self, config: LocatorConfig) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class Locator(nn.Module):
         with torch.no_grad():
             self.head.bias.copy_(torch.tensor([-4.0, -1.5, -1.5, -1.5, -1.5]))  # type: ignore[union-attr]
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 5 h4 w4"]:
+    def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 5 h4 w4"], ...]:
         check_input(image)
         raw = self.head(self.pyramid(self.encoder(image))).float()
-        return torch.cat([torch.sigmoid(raw[:, :1]), functional.softplus(raw[:, 1:])], dim=1)
+        return (torch.cat([torch.sigmoid(raw[:, :1]), functional.softplus(raw[:, 1:])], dim=1),)

@@ -12,8 +12,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from gknet.errors import GknetError
 from gknet.io.atomic import write_text
 from gknet.network.build import GRAPH_NETWORKS, NETWORKS, OWN_LOSS_NETWORKS, default_loss
-from gknet.network.graph import checked_graph
-from gknet.network.heatmap import checked_loss
+from gknet.network.spec import checked_graph, checked_loss
 from gknet.training.cache import Window
 from gknet.training.schedule import Stage
 

@@ -13,9 +13,9 @@ from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.direct_estimator import has_square_pixels
-from gknet.network.build import Network
 from gknet.network.dmanet import DMANet
 from gknet.network.locator import Locator
+from gknet.network.network import Network
 from gknet.spacecraft import Spacecraft
 from gknet.training.cache import Cache, FrameSource, build_cache
 from gknet.training.settings import TrainSettings
