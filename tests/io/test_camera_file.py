@@ -12,7 +12,8 @@ import pytest
 from gknet.dataset.skd_write import write_camera_matrix
 from gknet.errors import GknetError
 from gknet.geometry import Camera
-from gknet.io.camera_file import FieldOfView, MatrixOnly, camera_for, read_camera
+from gknet.io.camera_file import read_camera
+from gknet.io.lens import FieldOfView, MatrixOnly, camera_for
 
 K = np.array([[500.0, 0, 311], [0, 510, 242], [0, 0, 1]])
 BENT = [-0.2, 0.1, 0.001, -0.002, 0.05]

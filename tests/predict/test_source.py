@@ -9,8 +9,8 @@ import pytest
 
 from gknet.errors import GknetError
 from gknet.frame import Frame, Unreadable
-from gknet.io.camera_file import FieldOfView
 from gknet.io.image import write_image
+from gknet.io.lens import FieldOfView
 from gknet.io.video import VideoWriter
 from gknet.predict.source import open_source
 from gknet.spacecraft import Spacecraft

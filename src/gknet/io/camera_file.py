@@ -1,128 +1,75 @@
-"""Camera files: our own JSON, SPEED+'s camera.json, and a 3x3 matrix as text (an SKD dataset's or OpenCV's).
+"""Camera files of gknet and of neighbouring tools; which format a file has is found from its content.
 
-SPEED+ puts its principal point at half the image's size, which is the image's centre in our pixels too, so it is kept.
+| format | principal point |
+|---|---|
+| gknet's JSON: matrix, width, height, distortion, model | in our pixels |
+| SPEED+'s camera.json | at half the image's size, which is the centre in our pixels too: kept |
+| a 3 x 3 matrix as text, in OpenCV's or SKD's order of axes | in our pixels |
+| COLMAP's cameras.txt | in our pixels: its top-left pixel has its centre at (0.5, 0.5) too |
+| OpenCV's FileStorage (YAML, XML, JSON) | pixel centres are integers: 0.5 is added |
+| ROS's camera_info (YAML) | pixel centres are integers: 0.5 is added |
+| Kalibr's camchain (YAML) | pixel centres are integers: 0.5 is added |
+| BOP's camera.json | pixel centres are integers: 0.5 is added |
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera
-from gknet.io.text import read_json
-from gknet.io.text_table import read_skd_camera_matrix, read_table
+from gknet.io.camera_colmap import from_colmap, is_colmap
+from gknet.io.camera_json import from_json
+from gknet.io.camera_opencv import from_xml
+from gknet.io.camera_yaml import from_yaml
+from gknet.io.lens import FieldOfView as FieldOfView  # until its importers follow
+from gknet.io.lens import Lens as Lens
+from gknet.io.lens import MatrixOnly
+from gknet.io.text import parse_json, read_text
+from gknet.io.text_table import parse_table, skd_camera_matrix
 
-_OURS = {"matrix", "width", "height", "distortion"}
+LIMIT_BYTES = 256 * 1024
+"""A camera file is a few hundred bytes."""
 
-
-@dataclass(frozen=True, eq=False)
-class MatrixOnly:
-    """A camera matrix whose image size is not known from its file."""
-
-    matrix: Float[ndarray, "3 3"]
-    source: str
-
-    def camera(self, width: int, height: int) -> Camera:
-        return _named(self.source, self.matrix, width, height, None)
-
-
-@dataclass(frozen=True)
-class FieldOfView:
-    """A centred camera with square pixels, known by its horizontal field of view or its focal length."""
-
-    focal_px: float | None = None
-    horizontal_rad: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.focal_px is None) == (self.horizontal_rad is None):
-            raise GknetError("camera: give either a focal length in pixels or a horizontal field of view")
-        if self.focal_px is not None and not (math.isfinite(self.focal_px) and self.focal_px > 0):
-            raise GknetError(f"focal length: expected a positive number of pixels, got {self.focal_px}")
-        if self.horizontal_rad is not None and not 0 < self.horizontal_rad < math.pi:
-            degrees = math.degrees(self.horizontal_rad)
-            raise GknetError(f"field of view: expected between 0 and 180 degrees, got {degrees:g}")
-
-    def camera(self, width: int, height: int) -> Camera:
-        focal = self.focal_px or width / 2 / math.tan((self.horizontal_rad or 0.0) / 2)
-        return Camera.from_focal(focal, width, height)
-
-
-Lens = Camera | MatrixOnly | FieldOfView
-"""Where a picture's camera comes from; the last two learn the image size from the picture."""
-
-
-def camera_for(lens: Lens, width: int, height: int) -> Camera:
-    """The camera of a width x height picture; GknetError when the camera was made for another size."""
-    if not isinstance(lens, Camera):
-        return lens.camera(width, height)
-    if (lens.width, lens.height) != (width, height):
-        raise GknetError(f"camera: it is for {lens.width} x {lens.height} pixels, the image has {width} x {height}")
-    return lens
+FORMATS = (
+    "gknet's JSON, SPEED+'s or BOP's camera.json, OpenCV's YAML, XML or JSON, ROS's camera_info, Kalibr's camchain, "
+    "COLMAP's cameras.txt, or a 3x3 matrix as text"
+)
 
 
 def read_camera(path: str | Path) -> Camera | MatrixOnly:
-    """Read a camera file of one of the three formats; every defect is a GknetError that names the file."""
-    path = Path(path)
-    return _from_json(path) if path.suffix.lower() == ".json" else _from_matrix_text(path)
+    """The camera of a file.
+
+    Args:
+        path: a file of one of the formats above, of any name.
+
+    Returns:
+        A `Camera`, or a `MatrixOnly` where the file does not state the image size.
+
+    Raises:
+        GknetError: the file cannot be read, has no known format, or its values are no camera. It names the file.
+    """
+    text = read_text(path, LIMIT_BYTES)
+    lines = (line.strip() for line in text.splitlines())
+    first = next((line for line in lines if line and not line.startswith(("#", "---"))), "")
+    if first.startswith(("{", "[{")):
+        return from_json(path, parse_json(text, path))
+    if first.startswith("<"):
+        return from_xml(path, text)
+    if is_colmap(first):
+        return from_colmap(path, text)
+    if first.startswith("%YAML") or re.match(r"[^\s:,]+:(\s|$)", first):
+        return from_yaml(path, text)
+    if re.match(r"[-+.\d]", first):
+        return _from_matrix_text(path, text)
+    raise GknetError(f"{path}: expected a camera file: {FORMATS}")
 
 
-def _named(source: object, matrix: object, width: object, height: object, distortion: object) -> Camera:
-    """A camera of values as they stood in `source`, which its errors name."""
-    columns, rows = _whole(source, "width", width), _whole(source, "height", height)
-    bent = np.zeros(5) if distortion is None else _numbers(source, "camera distortion", distortion, (5,))
-    straight = _numbers(source, "camera matrix", matrix, (3, 3))
-    try:
-        return Camera(straight, columns, rows, bent)
-    except GknetError as error:
-        raise GknetError(f"{source}: {error}") from error
-
-
-def _whole(source: object, name: str, value: object) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise GknetError(f"{source}: {name}: expected a whole number of pixels, got {value!r}")
-    return value
-
-
-def _numbers(source: object, name: str, values: object, shape: tuple[int, ...]) -> ndarray:
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise GknetError(f"{source}: {name}: expected numbers of shape {shape}, got {values!r}") from error
-    if array.shape != shape:
-        raise GknetError(f"{source}: {name}: expected shape {shape}, got {array.shape}")
-    return array
-
-
-def _from_json(path: Path) -> Camera:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise GknetError(f"{path}: expected a JSON object with a camera, got {type(content).__name__}")
-    if "cameraMatrix" in content:
-        return _from_speed_plus(path, content)
-    missing, unknown = {"matrix", "width", "height"} - set(content), set(content) - _OURS
-    if missing or unknown:
-        problem = f"missing {', '.join(sorted(missing))}" if missing else f"unknown key {', '.join(sorted(unknown))}"
-        raise GknetError(f"{path}: {problem}; expected matrix, width, height and perhaps distortion")
-    return _named(path, content["matrix"], content["width"], content["height"], content.get("distortion"))
-
-
-def _from_speed_plus(path: Path, content: dict[str, object]) -> Camera:
-    missing = {"Nu", "Nv", "distCoeffs"} - set(content)
-    if missing:
-        raise GknetError(f"{path}: missing {', '.join(sorted(missing))} beside cameraMatrix")
-    return _named(path, content["cameraMatrix"], content["Nu"], content["Nv"], content["distCoeffs"])
-
-
-def _from_matrix_text(path: Path) -> MatrixOnly:
-    table = read_table(path)
+def _from_matrix_text(path: str | Path, text: str) -> MatrixOnly:
+    table = parse_table(text, path)
     if table.shape != (3, 3):
         raise GknetError(f"{path}: expected a 3 x 3 camera matrix, got {table.shape[0]} rows of 3 numbers")
-    if np.allclose(table[2], (0, 0, 1)):
-        return MatrixOnly(table, str(path))
-    return MatrixOnly(read_skd_camera_matrix(path), str(path))
+    return MatrixOnly(table if np.allclose(table[2], (0, 0, 1)) else skd_camera_matrix(table, path), str(path))

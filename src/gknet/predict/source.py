@@ -11,8 +11,8 @@ from gknet.dataset.skd import SkdDataset, open_dataset
 from gknet.dataset.skd_format import SPLITS
 from gknet.errors import GknetError
 from gknet.frame import Frame, Unreadable
-from gknet.io.camera_file import Lens, camera_for
 from gknet.io.image import read_image
+from gknet.io.lens import Lens, camera_for
 from gknet.io.video import VIDEO_SUFFIXES, Video, open_video
 from gknet.spacecraft import Spacecraft
 
