@@ -321,7 +321,7 @@ def test_the_remedies_for_a_matrix_of_another_resolution(tmp_path: Path) -> None
 def test_a_camera_of_another_size_is_scaled_on_request() -> None:
     camera = Camera(K, 640, 480)
     assert camera_for(camera, 320, 240, scale=True).matrix[0, 0] == 250
-    with pytest.raises(GknetError, match="640 x 480 pixels, the image has 320 x 240.*--scale-camera"):
+    with pytest.raises(GknetError, match=r"640 x 480 pixels, the image has 320 x 240.*--scale-camera"):
         camera_for(camera, 320, 240)
     with pytest.raises(GknetError, match="states its own size, it is for 640x480"):
         sized_lens(camera, (320, 240), scale=False)
