@@ -12,6 +12,7 @@ import pytest
 import typer
 
 from gknet.cli.main import app
+from gknet.frame import FailureKind
 from tests.docs.pages import ROOT, anchors, blocks, links, name_of, pages, prose
 
 PAGES = pages()
@@ -81,3 +82,8 @@ def test_python_blocks_are_python(page: Path) -> None:
     for block in blocks(page):
         if block.language == "python":
             ast.parse(block.text, f"{name_of(page)}:{block.line}")
+
+
+def test_every_kind_of_failure_is_explained() -> None:
+    listed = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "howto" / "poses-file.md").read_text("utf-8"), re.MULTILINE)
+    assert listed == [kind.value for kind in FailureKind]
