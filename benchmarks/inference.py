@@ -29,8 +29,9 @@ from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.inference.decode import decode_heatmaps
 from gknet.inference.direct_estimator import DirectEstimator, decode_output
-from gknet.inference.estimator import Estimator, load_estimator
-from gknet.inference.locate import network_input
+from gknet.inference.keypoint_estimator import KeypointEstimator
+from gknet.inference.load import load_estimator
+from gknet.inference.network_io import network_input
 from gknet.inference.pnp import solve_pnp
 
 CAMERA = Camera.from_focal(1400, 1024, 1024)
@@ -47,7 +48,7 @@ def median_ms(call: Callable[[], object], runs: int) -> float:
     return 1000 * float(np.median(times))
 
 
-def stages(estimator: Estimator | DirectEstimator, runs: int) -> dict[str, float]:
+def stages(estimator: KeypointEstimator | DirectEstimator, runs: int) -> dict[str, float]:
     """Median milliseconds of each stage, and of the whole way from a 1024 x 1024 frame to a pose."""
     image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
     crop = Crop(200, 200, 600, estimator.settings.input_size)
@@ -59,13 +60,13 @@ def stages(estimator: Estimator | DirectEstimator, runs: int) -> dict[str, float
         found["locate (whole frame)"] = median_ms(lambda: estimator.locate(image), runs)
         whole += found["locate (whole frame)"]
     found["frame to pose"] = whole
-    if isinstance(estimator, Estimator):
+    if isinstance(estimator, KeypointEstimator):
         found["pose without the box's say"] = keypoint_stages(estimator, given, crop, runs, False)["pose"]
     return found
 
 
 def keypoint_stages(
-    estimator: Estimator, given: ndarray, crop: Crop, runs: int, trust_box: bool = True
+    estimator: KeypointEstimator, given: ndarray, crop: Crop, runs: int, trust_box: bool = True
 ) -> dict[str, float]:
     """From the crop to a pose by keypoints."""
     craft = estimator.spacecraft

@@ -21,7 +21,8 @@ from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Polygon
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from gknet import Box, Crop, Pose
+from gknet import Box, Pose
+from gknet.inference.crop import Crop
 
 INK, BLUE, ORANGE, GREEN, GREY = "#222222", "#1f5fa8", "#c8560a", "#2f7d32", "#9a9a9a"
 PALE_BLUE, PALE_ORANGE, PALE_GREEN, PALE_GREY = "#dce8f5", "#fbe5d3", "#dcefdc", "#efefef"

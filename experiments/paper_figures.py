@@ -26,7 +26,7 @@ from gknet.errors import GknetError, ends_in_one_line
 from gknet.evaluation.metrics import compute_errors, oracle_crop
 from gknet.fleet import NAMES
 from gknet.frame import Estimate, Failure, FailureKind, Frame
-from gknet.inference.estimator import load_estimator
+from gknet.inference.load import load_estimator
 from gknet.io.atomic import write_bytes
 from gknet.report.canvas import Canvas
 from gknet.report.overlay import draw_overlay, zoomed

@@ -47,7 +47,7 @@ from gknet.evaluation.evaluate import ProtocolRun, evaluate
 from gknet.evaluation.paper_protocol import PaperEstimator
 from gknet.fleet import NAMES
 from gknet.inference.direct_estimator import DirectEstimator
-from gknet.inference.estimator import load_estimator
+from gknet.inference.load import load_estimator
 from gknet.inference.onnx_model import OnnxModel
 from gknet.io.atomic import write_text
 from gknet.render.generate import generate

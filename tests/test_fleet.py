@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from gknet import fleet
 from gknet.cli.fleet import fleet as fleet_command
 from gknet.errors import GknetError, MissingExtraError
-from gknet.spacecraft import Symmetry, load_spacecraft
+from gknet.io.spacecraft_file import load_spacecraft
+from gknet.spacecraft import Symmetry
 
 NEAR_M = 0.02
 names = pytest.mark.parametrize("name", fleet.NAMES)

@@ -16,10 +16,9 @@ SOURCE = Path(__file__).parents[1] / "src" / "gknet"
 
 LAYERS = (
     {"errors"},
-    {"geometry"},
+    {"geometry", "spacecraft"},
     {"frame"},
     {"io"},
-    {"spacecraft"},
     {"dataset", "fleet", "inference"},
     {"network"},
     {"evaluation"},

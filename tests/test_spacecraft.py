@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gknet.errors import GknetError
-from gknet.spacecraft import Spacecraft, Symmetry, diameter, load_spacecraft, save_spacecraft, spacecraft_toml
+from gknet.io.spacecraft_file import load_spacecraft, save_spacecraft, spacecraft_toml
+from gknet.spacecraft import Spacecraft, Symmetry, diameter
 
 GOOD = """
 name = "probe"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -11,6 +12,7 @@ from numpy import ndarray
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
+from gknet.spacecraft import Spacecraft
 
 
 @dataclass(frozen=True)
@@ -220,8 +222,8 @@ class Failure:
     """Why there is no pose. `str(failure)` is its detail.
 
     Attributes:
-        kind: what a program branches on; the same cause always has the same kind.
-        detail: one line for people, with the numbers of this picture. Its wording may change between versions.
+        kind: What a program branches on; the same cause always has the same kind.
+        detail: One line for people, with the numbers of this picture. Its wording may change between versions.
     """
 
     kind: FailureKind
@@ -277,13 +279,47 @@ class Estimate:
         return self.attitude_confidence is not None and self.attitude_confidence < AMBIGUOUS_BELOW
 
 
+class PoseEstimator(Protocol):
+    """What estimates poses of one known spacecraft: by keypoints, by direct pose regression, or a class of your own.
+
+    `gknet.load_estimator` returns one; prediction and evaluation take any.
+    """
+
+    @property
+    def spacecraft(self) -> Spacecraft:
+        """The spacecraft whose pose is estimated."""
+        ...
+
+    @property
+    def has_locator(self) -> bool:
+        """Whether `estimate` works without a box."""
+        ...
+
+    def estimate(self, image: UInt8[ndarray, "h w *c"], camera: Camera, box: Box | None = None) -> Estimate:
+        """Estimate the pose of the spacecraft in an image.
+
+        Args:
+            image: uint8, RGB of shape (h, w, 3) or grey of shape (h, w).
+            camera: The camera of the image; its width and height are the image's.
+            box: Where the spacecraft is, in px of the image: about all keypoints, hidden ones too. None lets the
+                locator find it.
+
+        Returns:
+            The pose, or an `Estimate` whose `failure` states why there is none.
+
+        Raises:
+            GknetError: The image is of another kind or size, or there is neither a box nor a locator.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Unreadable:
     """A picture that is listed but cannot be read, and why.
 
     Attributes:
-        name: the picture's name, as that of a `Frame`.
-        failure: why it cannot be read; its kind is `unreadable_image` unless there is a better one.
+        name: The picture's name, as that of a `Frame`.
+        failure: Why it cannot be read; its kind is `unreadable_image` unless there is a better one.
     """
 
     name: str
@@ -294,7 +330,7 @@ class Unreadable:
         """A picture that cannot be read.
 
         Args:
-            name: the picture's name.
-            reason: an error or a sentence; its text becomes the failure's detail.
+            name: The picture's name.
+            reason: An error or a sentence; its text becomes the failure's detail.
         """
         return Unreadable(name, Failure(FailureKind.UNREADABLE_IMAGE, str(reason)))

@@ -1,11 +1,9 @@
-"""A known spacecraft: its mesh, named keypoints, skeleton and symmetries, and the .toml that keeps them."""
+"""A known spacecraft: its mesh, named keypoints, skeleton and symmetries."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -15,14 +13,25 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from gknet.errors import GknetError
-from gknet.io.atomic import write_text
-from gknet.io.text import parse_toml, read_text, validated
+
+MAX_KEYPOINTS = 1000
+"""A heatmap belongs to each keypoint, and a square of this number to the graph: more would not fit into memory."""
+
+MAX_EXTENT_M = 1e5
+"""Larger coordinates and diameters are a slip of the unit, and their squares would lose precision."""
 
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 
 
 class Symmetry(BaseModel):
-    """A turn of the body that leaves its look nearly (or exactly) unchanged."""
+    """A rotation of the body that leaves its appearance nearly (or exactly) unchanged.
+
+    Attributes:
+        axis: (3,) the axis of rotation in the body frame, of any length.
+        angle_deg: The angle in degrees.
+        exact: Whether nothing at all tells the two attitudes apart.
+        broken_by: What does tell them apart, for people.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,27 +39,6 @@ class Symmetry(BaseModel):
     angle_deg: FiniteFloat
     exact: bool = False
     broken_by: str = ""
-
-
-class _Keypoint(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    name: str
-    point_m: Vector
-
-
-class _File(BaseModel):
-    """The .toml file, as it is written."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    name: str
-    description: str = ""
-    mesh: str | None = None
-    diameter_m: Annotated[FiniteFloat, Field(gt=0)]
-    keypoint: Annotated[list[_Keypoint], Field(min_length=4)]
-    edges: list[tuple[str, str]]
-    symmetry: list[Symmetry] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +58,8 @@ class Spacecraft:
         description: One sentence for people.
 
     Raises:
-        GknetError: Shapes do not agree, names repeat, or an edge has no keypoint.
+        GknetError: Shapes do not agree, there are more than 1,000 keypoints, a length is not finite or beyond 100 km,
+            names repeat, or an edge has no keypoint.
     """
 
     name: str
@@ -83,14 +72,10 @@ class Spacecraft:
     description: str = ""
 
     def __post_init__(self) -> None:
-        points = np.array(self.points_m, dtype=np.float64)
-        points.setflags(write=False)
-        object.__setattr__(self, "points_m", points)
         count = len(self.keypoint_names)
-        if points.shape != (count, 3) or not np.isfinite(points).all():
-            raise GknetError(
-                f"{self.name}: expected {count} finite keypoints of shape ({count}, 3), got {points.shape}"
-            )
+        object.__setattr__(self, "points_m", _checked_points(self.name, self.points_m, count))
+        if not 0 < self.diameter_m <= MAX_EXTENT_M:
+            raise GknetError(f"{self.name}: expected a diameter of 0 to {MAX_EXTENT_M:g} m, got {self.diameter_m}")
         if len(set(self.keypoint_names)) != count:
             raise GknetError(f"{self.name}: keypoint names must differ from each other")
         for i, j in self.edges:
@@ -114,73 +99,22 @@ class Spacecraft:
 
 
 def diameter(points_m: Float[ndarray, "n 3"]) -> float:
-    """The largest distance between two of the points."""
+    """The largest distance between two of the points, which do not lie in one plane."""
     from scipy.spatial import ConvexHull
 
     hull = points_m[ConvexHull(points_m).vertices]
-    return float(max(np.linalg.norm(a - b) for a, b in combinations(hull, 2)))
+    return float(max(np.linalg.norm(hull - point, axis=1).max() for point in hull))
 
 
-def load_spacecraft(path: str | Path) -> Spacecraft:
-    """Read a spacecraft's .toml.
-
-    Args:
-        path: The file; the mesh that it names is expected beside it.
-
-    Raises:
-        GknetError: The file cannot be read, is no valid TOML, or describes no spacecraft.
-    """
-    path = Path(path)
-    return spacecraft_from_toml(read_text(path), str(path), path.parent)
-
-
-def spacecraft_from_toml(text: str, source: str, folder: Path | None = None) -> Spacecraft:
-    """Parse the text of a spacecraft's .toml. Errors name `source`; without a mesh's `folder` there is no mesh."""
-    file: _File = validated(_File, parse_toml(text, source), source)
-    index = {keypoint.name: k for k, keypoint in enumerate(file.keypoint)}
-    for edge in file.edges:
-        for end in edge:
-            if end not in index:
-                raise GknetError(f"{source}: edges: '{end}' is no keypoint; expected one of {', '.join(index)}")
-    try:
-        return Spacecraft(
-            name=file.name,
-            keypoint_names=tuple(keypoint.name for keypoint in file.keypoint),
-            points_m=np.array([keypoint.point_m for keypoint in file.keypoint]),
-            edges=tuple((index[a], index[b]) for a, b in file.edges),
-            diameter_m=file.diameter_m,
-            symmetries=tuple(file.symmetry),
-            mesh_path=folder / file.mesh if folder is not None and file.mesh else None,
-            description=file.description,
-        )
-    except GknetError as error:
-        raise GknetError(f"{source}: {error}") from error
-
-
-def _quoted(text: str) -> str:
-    """A TOML basic string: JSON's escapes are among TOML's, and the delete character must be escaped too."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def spacecraft_toml(spacecraft: Spacecraft) -> str:
-    """The text of a spacecraft's .toml, keypoints to a tenth of a millimetre."""
-    names = spacecraft.keypoint_names
-    lines = [f"name = {_quoted(spacecraft.name)}", f"description = {_quoted(spacecraft.description)}"]
-    if spacecraft.mesh_path is not None:
-        lines.append(f"mesh = {_quoted(spacecraft.mesh_path.name)}")
-    lines.append(f"diameter_m = {spacecraft.diameter_m:.4f}")
-    lines.append("edges = [")
-    lines += [f"  [{_quoted(names[i])}, {_quoted(names[j])}]," for i, j in spacecraft.edges]
-    lines.append("]")
-    for name, point in zip(names, spacecraft.points_m, strict=True):
-        coordinates = ", ".join(f"{value + 0.0:.4f}" for value in np.round(point, 4) + 0.0)
-        lines += ["", "[[keypoint]]", f"name = {_quoted(name)}", f"point_m = [{coordinates}]"]
-    for symmetry in spacecraft.symmetries:
-        axis = ", ".join(f"{value:g}" for value in symmetry.axis)
-        lines += ["", "[[symmetry]]", f"axis = [{axis}]", f"angle_deg = {symmetry.angle_deg:g}"]
-        lines += [f"exact = {str(symmetry.exact).lower()}", f"broken_by = {_quoted(symmetry.broken_by)}"]
-    return "\n".join(lines) + "\n"
-
-
-def save_spacecraft(spacecraft: Spacecraft, path: str | Path) -> None:
-    write_text(path, spacecraft_toml(spacecraft))
+def _checked_points(name: str, points_m: object, count: int) -> Float[ndarray, "n 3"]:
+    """A read-only copy of the keypoints, or a GknetError."""
+    points = np.array(points_m, dtype=np.float64)
+    if count > MAX_KEYPOINTS:
+        raise GknetError(f"{name}: expected at most {MAX_KEYPOINTS} keypoints, got {count}")
+    if points.shape != (count, 3) or not np.isfinite(points).all():
+        raise GknetError(f"{name}: expected {count} finite keypoints of shape ({count}, 3), got {points.shape}")
+    if count and np.abs(points).max() > MAX_EXTENT_M:
+        largest = np.abs(points).max()
+        raise GknetError(f"{name}: expected keypoints within {MAX_EXTENT_M:g} m of the origin, got {largest:g} m")
+    points.setflags(write=False)
+    return points

@@ -22,7 +22,8 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[ToyEstimator], None]:
     monkeypatch.setenv("GKNET_DEBUG", "1")
 
     def put(estimator: ToyEstimator) -> None:
-        monkeypatch.setattr("gknet.inference.estimator.load_estimator", lambda name, **options: estimator)
+        monkeypatch.setattr("gknet.inference.load.shipped_folder", Path)
+        monkeypatch.setattr("gknet.inference.load.load_estimator", lambda name, **options: estimator)
 
     return put
 

@@ -16,7 +16,7 @@ from tests.cli.toy import ToyEstimator
 @pytest.fixture
 def bundled(monkeypatch: pytest.MonkeyPatch, dataset: Path, use: Callable[[ToyEstimator], None]) -> None:
     use(ToyEstimator(error=1.0, blind=frozenset({2})))
-    monkeypatch.setattr("gknet.inference.estimator.shipped_models", lambda: ("toycraft",))
+    monkeypatch.setattr("gknet.inference.load.shipped_models", lambda: ("toycraft",))
     monkeypatch.setattr("gknet.cli.demo.bundled_frames", lambda: dataset)
 
 
@@ -44,6 +44,6 @@ def test_demo_writes_all_it_promises(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_without_models_it_says_so(
     monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("gknet.inference.estimator.shipped_models", lambda: ())
+    monkeypatch.setattr("gknet.inference.load.shipped_models", lambda: ())
     assert "no model is shipped" in refused("demo", "--out", tmp_path / "demo")
     assert not (tmp_path / "demo").exists()

@@ -12,7 +12,8 @@ from gknet.cli import doctor
 from gknet.cli.doctor import Finding, State
 from gknet.cli.main import run
 from gknet.errors import GknetError
-from gknet.inference.locate import InferenceSettings, NetworkOutput
+from gknet.inference.crop_estimator import InferenceSettings
+from gknet.inference.network_io import NetworkOutput
 from gknet.spacecraft import Spacecraft
 from tests.cli.toy import toy_spacecraft
 
@@ -33,8 +34,8 @@ class ToyModel:
 @pytest.fixture
 def model(monkeypatch: pytest.MonkeyPatch) -> Callable[[ToyModel], None]:
     def put(toy: ToyModel) -> None:
-        monkeypatch.setattr("gknet.inference.estimator.shipped_models", lambda: ("toycraft",))
-        monkeypatch.setattr("gknet.inference.estimator.load_estimator", lambda name: toy)
+        monkeypatch.setattr("gknet.inference.load.shipped_models", lambda: ("toycraft",))
+        monkeypatch.setattr("gknet.inference.load.load_estimator", lambda name: toy)
 
     return put
 

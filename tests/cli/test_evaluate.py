@@ -111,7 +111,7 @@ def test_every_takes_fewer_frames(use: Use, dataset: Path, tmp_path: Path) -> No
 
 
 def test_without_a_locator_only_the_oracle_is_run(use: Use, dataset: Path, tmp_path: Path) -> None:
-    use(replace(ToyEstimator(), locator=None))
+    use(replace(ToyEstimator(), has_locator=False))
     metrics, _ = evaluated(dataset, tmp_path)
     assert list(metrics["runs"]) == ["oracle"]
 

@@ -14,7 +14,8 @@ from gknet.dataset.skd_write import write_annotations, write_frame_files, write_
 from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.io.atomic import write_text
-from gknet.spacecraft import Spacecraft, spacecraft_toml
+from gknet.io.spacecraft_file import spacecraft_toml
+from gknet.spacecraft import Spacecraft
 
 SIZE, FOCAL_PX = 256, 350.0
 CAMERA = Camera.from_focal(FOCAL_PX, SIZE, SIZE)
@@ -99,7 +100,7 @@ class ToyEstimator:
     blind: frozenset[int] = frozenset()
     doubted: frozenset[int] = frozenset()
     spacecraft: Spacecraft = field(default_factory=toy_spacecraft)
-    locator: object = "the toy finds itself"
+    has_locator: bool = True
 
     def estimate(self, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
         number = picture_number(image)

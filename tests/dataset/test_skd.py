@@ -17,7 +17,8 @@ from gknet.dataset.skd_write import write_annotations, write_frame_files, write_
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
-from gknet.spacecraft import Spacecraft, save_spacecraft
+from gknet.io.spacecraft_file import save_spacecraft
+from gknet.spacecraft import Spacecraft
 
 POINTS = np.array([[1.2, 0.1, -0.3], [-1.1, 0.7, 0.2], [0.3, -1.4, 0.9], [0.5, 0.4, 1.7], [-0.6, -0.8, -1.3]])
 EDGES = ((0, 1), (1, 2), (2, 3), (0, 4))

@@ -14,8 +14,9 @@ from gknet.evaluation.metrics import nees
 from gknet.frame import Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
-from gknet.inference.estimator import Estimator
-from gknet.inference.locate import InferenceSettings, NetworkOutput
+from gknet.inference.crop_estimator import InferenceSettings
+from gknet.inference.keypoint_estimator import KeypointEstimator
+from gknet.inference.network_io import NetworkOutput
 from gknet.spacecraft import Spacecraft
 
 POINTS = np.random.default_rng(7).uniform(-1, 1, (14, 3)) * (3, 1, 1)
@@ -59,7 +60,7 @@ def samples(common_px: float, own_px: float, rng: np.random.Generator, count: in
     return made
 
 
-def median_nees(estimator: Estimator, seen: list[CalibrationSample]) -> float:
+def median_nees(estimator: KeypointEstimator, seen: list[CalibrationSample]) -> float:
     found = [nees(s.frame.cam_from_body, s.estimate(estimator)) for s in seen if s.frame.cam_from_body is not None]
     return float(np.median([value for value in found if value is not None]))
 
@@ -67,7 +68,7 @@ def median_nees(estimator: Estimator, seen: list[CalibrationSample]) -> float:
 @pytest.mark.parametrize("common_px", [0.0, 8.0])
 def test_a_calibrated_covariance_fits_on_other_frames(common_px: float) -> None:
     rng = np.random.default_rng(1)
-    bare = Estimator(NetworkOutput, CRAFT, settings=InferenceSettings(input_size=192), decoding=UNCALIBRATED)
+    bare = KeypointEstimator(NetworkOutput, CRAFT, settings=InferenceSettings(input_size=192), decoding=UNCALIBRATED)
     estimator = calibrated(bare, samples(common_px, 1.0, rng))
     assert (estimator.pnp.covariance_scale > 1.5) == (common_px > 0)
     assert median_nees(estimator, samples(common_px, 1.0, rng)) == pytest.approx(5.35, rel=0.3)
@@ -77,7 +78,7 @@ def test_a_calibrated_covariance_fits_on_other_frames(common_px: float) -> None:
 
 
 def test_too_few_keypoints_are_refused() -> None:
-    bare = Estimator(NetworkOutput, CRAFT, decoding=UNCALIBRATED)
+    bare = KeypointEstimator(NetworkOutput, CRAFT, decoding=UNCALIBRATED)
     with pytest.raises(GknetError, match="at least 30"):
         calibrated(bare, samples(0, 1.0, np.random.default_rng(2), count=2))
 
@@ -89,7 +90,7 @@ def test_a_sight_decodes_as_the_estimator_does() -> None:
     y, x = np.mgrid[:48, :48] + 0.5
     squared = (x - cells[:, :1, None]) ** 2 + (y - cells[:, 1:, None]) ** 2
     heatmaps = (0.7 * np.exp(-squared / (2 * 1.5**2))).astype(np.float32)[None]
-    bare = Estimator(
+    bare = KeypointEstimator(
         lambda images: NetworkOutput(heatmaps), CRAFT, settings=InferenceSettings(input_size=192), decoding=UNCALIBRATED
     )
     seen = collect_sample(frame, bare, STRIDE)

@@ -10,7 +10,7 @@ from gknet.evaluation.metrics import pose_errors
 from gknet.evaluation.paper_protocol import PaperEstimator, highest_cells, plain_pnp
 from gknet.frame import Box
 from gknet.geometry import Camera, Pose
-from gknet.inference.locate import NetworkOutput
+from gknet.inference.network_io import NetworkOutput
 from gknet.spacecraft import Spacecraft
 
 POINTS = np.random.default_rng(3).uniform(-1, 1, (12, 3)) * (3, 1, 1)

@@ -14,7 +14,7 @@ from gknet.frame import Box
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop import Crop
-from gknet.inference.direct_estimator import least_turn
+from gknet.inference.crop_pose import smallest_rotation_to
 from tests.strategies import quaternions
 
 BINS = AttitudeBins(16)
@@ -47,7 +47,7 @@ def test_labels_wrap_where_angles_do(angles: tuple[float, float, float]) -> None
 
 
 def test_a_label_is_a_gaussian_of_the_angle_over_the_volume_of_rotations() -> None:
-    """Its spread about the attitude is SOFTNESS bins in each direction, poles or not."""
+    """Its spread about the attitude is LABEL_SIGMA_BINS bins in each direction, poles or not."""
     for middle in Rotation.random(20, rng=0):
         label = BINS.soft_label(middle.as_quat()[[3, 0, 1, 2]])
         centres = Rotation.from_quat(BINS.centres_wxyz[:, [1, 2, 3, 0]])
@@ -63,15 +63,15 @@ def test_of_two_twins_half_a_turn_apart_the_likelier_is_taken_whole() -> None:
     assert Pose.from_quaternion(BINS.attitude_wxyz(belief), np.zeros(3)).angle_to(one) < math.radians(2)
 
 
-def test_the_share_near_an_attitude_is_what_is_believed_of_it() -> None:
+def test_probability_near_an_attitude() -> None:
     one = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], np.zeros(3)).quaternion_wxyz
     twin = (Pose.from_quaternion(one, np.zeros(3)) @ HALF_TURN).quaternion_wxyz
     belief = 0.6 * BINS.soft_label(one) + 0.4 * BINS.soft_label(twin)
     for attitude, share in ((one, 0.6), (-one, 0.6), (twin, 0.4)):
-        assert BINS.share_near(belief, attitude, math.radians(60)) == pytest.approx(share, abs=0.01)
+        assert BINS.probability_near(belief, attitude, math.radians(60)) == pytest.approx(share, abs=0.01)
     everything = np.full(BINS.count, 1 / BINS.count)
-    assert BINS.share_near(everything, one, math.pi) == pytest.approx(1)
-    assert BINS.share_near(everything, one, math.radians(60)) < 0.15
+    assert BINS.probability_near(everything, one, math.pi) == pytest.approx(1)
+    assert BINS.probability_near(everything, one, math.radians(60)) < 0.15
 
 
 @pytest.mark.parametrize("chosen", [0, 300, 777, 1500, 2047])
@@ -80,7 +80,7 @@ def test_an_attitude_puts_keypoints_where_a_camera_far_away_sees_them(chosen: in
     camera = Camera.from_focal(40_000, 8000, 8000)
     place_m = np.array([30.0, -20.0, 400.0])
     attitude = Rotation.from_quat(BINS.centres_wxyz[chosen, [1, 2, 3, 0]]).as_matrix()
-    pixels = camera.project(Pose(least_turn(place_m) @ attitude, place_m).transform(POINTS))
+    pixels = camera.project(Pose(smallest_rotation_to(place_m) @ attitude, place_m).transform(POINTS))
     seen = Crop.around(Box.around(pixels), 256).to_input(pixels) / 256
     shares = BINS.keypoint_prior(POINTS, 16)[chosen]
     np.testing.assert_allclose(shares.sum(axis=(1, 2)), 1)

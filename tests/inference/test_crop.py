@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import resource
+
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gknet.errors import GknetError
@@ -98,6 +101,38 @@ def test_cut_has_the_size_and_leaves_the_image_alone(crop: Crop) -> None:
     assert cut.shape == (crop.size, crop.size, 3)
     assert cut.dtype == np.uint8
     assert (image == 77).all()
+
+
+def padded_first(crop: Crop, image: np.ndarray) -> np.ndarray:
+    """The plain way: the whole square, black where the image ends, then one resize. Too large for thin images."""
+    square = np.zeros((crop.side, crop.side, 3), dtype=np.uint8)
+    y0, x0 = max(crop.y0, 0), max(crop.x0, 0)
+    inside = image[y0 : max(crop.y0 + crop.side, 0), x0 : max(crop.x0 + crop.side, 0)]
+    top, left = y0 - crop.y0, x0 - crop.x0
+    square[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    method = cv2.INTER_AREA if crop.side > crop.size else cv2.INTER_LINEAR
+    return cv2.resize(square, (crop.size, crop.size), interpolation=method)
+
+
+@given(crops, st.sampled_from([(60, 800), (700, 90), (480, 640)]))
+@settings(max_examples=60, deadline=None)
+def test_cut_is_the_padded_square_within_a_level(crop: Crop, shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    difference = np.abs(crop.cut(image).astype(int) - padded_first(crop, image))
+    assert difference.max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(20, 100_000, 3), (100_000, 20, 3)])
+def test_memory_of_a_long_thin_image_is_bounded(shape: tuple[int, int, int]) -> None:
+    """The padded square would be 30 GB."""
+    image, side = np.full(shape, 200, dtype=np.uint8), max(shape)
+    whole = Crop((shape[1] - side) // 2, (shape[0] - side) // 2, side, 256)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    cut = whole.cut(image)
+    grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown_kib < 500 * 1024
+    assert cut.max() > 0
+    assert cut.any(axis=(0, 2)).sum() == (256 if shape[1] == side else 2)
 
 
 def test_camera_of_the_crop_projects_into_the_crop() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from gknet.errors import GknetError
 from gknet.inference.crop import Crop
-from gknet.inference.decode import Decoding, decode_heatmaps, decode_locator, keypoints_to_image
+from gknet.inference.decode import Decoding, decode_heatmaps, keypoints_to_image
 
 STRIDE = 4.0
 
@@ -121,32 +121,6 @@ def test_to_image_and_back() -> None:
 def test_bad_shape_is_refused() -> None:
     with pytest.raises(GknetError, match="shape"):
         decode_heatmaps(np.zeros((3, 2, 2), dtype=np.float32), STRIDE)
-
-
-def locator_output(box: tuple[float, float, float, float], peak: float = 1.0, size: int = 256) -> np.ndarray:
-    """What a perfect locator says of a box in input pixels."""
-    cells = size // 4
-    x0, y0, x1, y1 = box
-    centre = np.array([[(x0 + x1) / 8, (y0 + y1) / 8]])
-    y, x = (np.mgrid[:cells, :cells] + 0.5) * 4
-    sides = np.stack([x - x0, y - y0, x1 - x, y1 - y]) / size
-    return np.concatenate([gaussians(centre, 1.5, cells) * peak, sides]).astype(np.float32)
-
-
-@pytest.mark.parametrize("box", [(40.0, 60.0, 200.0, 100.0), (0.0, 0.0, 256.0, 256.0), (3.0, 5.0, 9.0, 12.0)])
-def test_locator_round_trip(box: tuple[float, float, float, float]) -> None:
-    found = decode_locator(locator_output(box), STRIDE, 256)
-    assert found is not None
-    np.testing.assert_allclose((found[0].x0, found[0].y0, found[0].x1, found[0].y1), box, atol=1.0)
-    assert found[1] > 0.5
-
-
-def test_locator_says_when_it_sees_nothing() -> None:
-    assert decode_locator(locator_output((40, 60, 200, 100), peak=0.05), STRIDE, 256) is None
-    assert decode_locator(np.full((5, 64, 64), np.nan, dtype=np.float32), STRIDE, 256) is None
-    assert decode_locator(np.full((5, 64, 64), -1, dtype=np.float32), STRIDE, 256) is None
-    with pytest.raises(GknetError, match=r"\(5, h, w\)"):
-        decode_locator(np.zeros((4, 64, 64), dtype=np.float32), STRIDE, 256)
 
 
 @pytest.mark.slow

@@ -16,8 +16,9 @@ from gknet.frame import FailureKind, Frame
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop import Crop
-from gknet.inference.direct_estimator import CropPose, DirectEstimator, decode_output, focal_px, least_turn
-from gknet.inference.locate import InferenceSettings
+from gknet.inference.crop_estimator import InferenceSettings
+from gknet.inference.crop_pose import CropPose, focal_px, smallest_rotation_to
+from gknet.inference.direct_estimator import DirectEstimator, decode_output
 from gknet.spacecraft import Spacecraft
 from tests.strategies import quaternions
 
@@ -81,7 +82,7 @@ def test_the_numbers_are_what_they_are_said_to_be() -> None:
 def test_a_far_corner_of_the_picture_shows_the_same_view() -> None:
     """NetworkOutput under the same line of sight, a craft has the same attitude and log_depth wherever it is."""
     middle = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], [0, 0, 20.0])
-    turn = least_turn(np.array([0.3, -0.2, 1.0]))
+    turn = smallest_rotation_to(np.array([0.3, -0.2, 1.0]))
     aside = Pose(turn @ middle.rotation, turn @ middle.translation_m)
     aside = Pose(aside.rotation, aside.translation_m * 20 / aside.translation_m[2])
     first, second = (CropPose.of(pose, CAMERA, Crop(0, 0, 300, 128), 4.0) for pose in (middle, aside))
@@ -93,7 +94,7 @@ def test_a_far_corner_of_the_picture_shows_the_same_view() -> None:
 @given(quaternions())
 def test_the_least_turn(quaternion: np.ndarray) -> None:
     ray = quaternion[1:] + np.array([0, 0, 2.0])
-    turn = least_turn(ray)
+    turn = smallest_rotation_to(ray)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(turn[:, 2], ray / np.linalg.norm(ray), atol=1e-12)
     angle = math.atan2(np.hypot(ray[0], ray[1]), ray[2])

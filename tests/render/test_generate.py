@@ -19,13 +19,14 @@ from gknet.frame import Box
 from gknet.geometry import Pose
 from gknet.inference.crop import Crop
 from gknet.io.image import read_image, read_mask
+from gknet.io.spacecraft_file import save_spacecraft
 from gknet.render import generate as stage
 from gknet.render import worker
 from gknet.render.plan import FILM_SIZES, Options, Selection, parse_shard, plan_sequences, target_window
 from gknet.render.recipe import Recipe, load_recipe
 from gknet.render.scenario import CAMERA, Sensor, Shot
 from gknet.render.scene import Rendered, Renderer
-from gknet.spacecraft import Spacecraft, save_spacecraft
+from gknet.spacecraft import Spacecraft
 from tests.dataset import authors
 
 POINTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.5], [0, 0, 1]])

@@ -21,8 +21,9 @@ from gknet.frame import Frame  # noqa: E402
 from gknet.geometry import Camera, Pose  # noqa: E402
 from gknet.inference.attitude import AttitudeBins  # noqa: E402
 from gknet.inference.crop import Crop  # noqa: E402
-from gknet.inference.direct_estimator import CropPose, DirectEstimator, decode_output  # noqa: E402
-from gknet.inference.estimator import load_estimator  # noqa: E402
+from gknet.inference.crop_pose import CropPose  # noqa: E402
+from gknet.inference.direct_estimator import DirectEstimator, decode_output  # noqa: E402
+from gknet.inference.load import load_estimator  # noqa: E402
 from gknet.network.build import build  # noqa: E402
 from gknet.network.dmanet import Branches, DMANet, DMANetConfig  # noqa: E402
 from gknet.training.augment import Augmentation, craft_warp, rotation  # noqa: E402

@@ -16,10 +16,10 @@ pytest.importorskip("lightning_fabric")
 import gknet.training.export as exporting  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
 from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.inference.estimator import load_estimator  # noqa: E402
+from gknet.inference.load import load_estimator  # noqa: E402
 from gknet.inference.onnx_model import OnnxModel  # noqa: E402
+from gknet.io.spacecraft_file import spacecraft_from_toml  # noqa: E402
 from gknet.network.build import build  # noqa: E402
-from gknet.spacecraft import spacecraft_from_toml  # noqa: E402
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
 from gknet.training.export import export_run  # noqa: E402
 from gknet.training.loop import train  # noqa: E402

@@ -9,7 +9,8 @@ torch = pytest.importorskip("torch")
 
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from gknet.inference.decode import SPREAD_CELLS, decode_heatmaps, decode_locator  # noqa: E402
+from gknet.inference.decode import SPREAD_CELLS, decode_heatmaps  # noqa: E402
+from gknet.inference.locator import decode_locator  # noqa: E402
 from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS  # noqa: E402
 from gknet.training.loss import (  # noqa: E402
     box_iou,

@@ -16,7 +16,7 @@ pytest.importorskip("mitsuba")
 
 from gknet.dataset.skd import SkdDataset  # noqa: E402
 from gknet.errors import GknetError  # noqa: E402
-from gknet.inference.estimator import load_estimator  # noqa: E402
+from gknet.inference.load import load_estimator  # noqa: E402
 from gknet.network.build import build  # noqa: E402
 from gknet.render.recipe import RECIPES  # noqa: E402
 from gknet.training.checkpoint import BEST, load_weights, save_weights  # noqa: E402

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from gknet.dataset.skd_format import Annotation, row_of
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
 from gknet.geometry import Camera, Pose
-from gknet.spacecraft import Spacecraft, save_spacecraft
+from gknet.io.spacecraft_file import save_spacecraft
+from gknet.spacecraft import Spacecraft
 
 BOX = np.array([(x, y, z) for x in (-1, 1) for y in (-0.8, 0.8) for z in (-0.6, 0.6)], dtype=float)
 WINGS = np.array([(s * x, y, 0.1) for s in (-1, 1) for x in (1.2, 3.2) for y in (-0.5, 0.5)], dtype=float)

@@ -12,7 +12,7 @@ from gknet.errors import GknetError
 if TYPE_CHECKING:
     from gknet.dataset.skd import SkdDataset
     from gknet.evaluation.evaluate import Evaluation
-    from gknet.inference.locate import CropEstimator
+    from gknet.frame import PoseEstimator
     from gknet.report.page import Section
 
 _FPS = 6.0
@@ -28,7 +28,7 @@ def demo(
     from rich.console import Console
 
     from gknet.dataset.skd import open_dataset
-    from gknet.inference.estimator import load_estimator, shipped_models
+    from gknet.inference.load import load_estimator, shipped_models
     from gknet.report.table import comparison_table
 
     start = time.perf_counter()
@@ -61,7 +61,7 @@ def bundled_frames() -> Path:
     return folder
 
 
-def show(dataset: SkdDataset, estimator: CropEstimator, out: Path) -> tuple[Section, list[Path]]:
+def show(dataset: SkdDataset, estimator: PoseEstimator, out: Path) -> tuple[Section, list[Path]]:
     """Evaluate one spacecraft, and write its poses, overlays and video of the last protocol."""
     from gknet.cli.evaluate import evaluate_section
     from gknet.predict.results import PredictionWriter

@@ -102,17 +102,17 @@ def _core_libraries() -> Finding:
 
 def _providers() -> Finding:
     try:
-        import onnxruntime
+        from gknet.inference.onnx_session import available_providers
     except ImportError as error:
         return Finding("onnxruntime", State.bad, f"cannot be imported: {error}", "pip install onnxruntime")
-    providers = onnxruntime.get_available_providers()
+    providers = available_providers()
     state = State.good if "CPUExecutionProvider" in providers else State.bad
     return Finding("onnxruntime", state, f"providers: {', '.join(providers)}")
 
 
 def _models() -> Iterator[Finding]:
     """Load each shipped model and run it once: shape, finite, and the same answer twice."""
-    from gknet.inference.estimator import shipped_models
+    from gknet.inference.load import shipped_models
 
     names = shipped_models()
     if not names:
@@ -131,7 +131,7 @@ def _try_model(name: str) -> str:
     import numpy as np
 
     from gknet.inference.direct_estimator import DirectEstimator
-    from gknet.inference.estimator import load_estimator
+    from gknet.inference.load import load_estimator
 
     estimator = load_estimator(name)
     settings = estimator.settings

@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from gknet.dataset.skd import SkdDataset
     from gknet.evaluation.evaluate import Evaluation
-    from gknet.inference.locate import CropEstimator
+    from gknet.frame import PoseEstimator
     from gknet.report.page import Section
 
 
@@ -49,14 +49,14 @@ def evaluate(
         typer.echo(f"wrote {path}")
 
 
-def evaluate_section(dataset: SkdDataset, estimator: CropEstimator, words: str, pictures: int) -> Section:
+def evaluate_section(dataset: SkdDataset, estimator: PoseEstimator, words: str, pictures: int) -> Section:
     """Evaluate with a progress bar, with the pictures for the page. Without a locator only the oracle's crop is run."""
     from gknet.evaluation.evaluate import PROTOCOL_WORDS, evaluate
     from gknet.io.progress import progress
     from gknet.report.gallery import galleries
     from gknet.report.page import Section
 
-    protocols = tuple(PROTOCOL_WORDS) if estimator.locator is not None else ("oracle",)
+    protocols = tuple(PROTOCOL_WORDS) if estimator.has_locator else ("oracle",)
     with progress() as bar:
         task = bar.add_task(estimator.spacecraft.name, total=len(dataset))
         evaluation = evaluate(dataset, estimator, protocols, words, on_frame=lambda: bar.advance(task))

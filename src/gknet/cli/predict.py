@@ -11,8 +11,7 @@ import typer
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
-    from gknet.frame import Box
-    from gknet.inference.locate import CropEstimator
+    from gknet.frame import Box, PoseEstimator
     from gknet.io.camera_file import Lens
     from gknet.predict.results import PredictionWriter
     from gknet.predict.source import Source
@@ -92,19 +91,19 @@ def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | N
 
 def choose_estimator(
     spacecraft: str | None, model: Path | None, threads: int | None, tta_rotations: int = 1
-) -> CropEstimator:
+) -> PoseEstimator:
     """The shipped model of a spacecraft, or a user's folder."""
-    from gknet.inference.estimator import load_estimator
+    from gknet.inference.load import load_estimator, shipped_folder
 
     if (spacecraft is None) == (model is None):
         raise GknetError("give either --spacecraft NAME (a shipped model) or --model FOLDER")
     if threads is not None and threads < 1:
         raise GknetError(f"--threads: expected 1 or more, got {threads}")
-    return load_estimator(model or spacecraft or "", threads=threads, tta_rotations=tta_rotations)
+    return load_estimator(model or shipped_folder(spacecraft or ""), threads=threads, tta_rotations=tta_rotations)
 
 
 def predict_all(
-    source: Source, estimator: CropEstimator, files: PredictionWriter, box: Box | None = None, oracle: bool = False
+    source: Source, estimator: PoseEstimator, files: PredictionWriter, box: Box | None = None, oracle: bool = False
 ) -> None:
     """Every picture of the source into the files; one that cannot be read is recorded and passed over."""
     from gknet.frame import Unreadable

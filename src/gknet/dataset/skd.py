@@ -15,8 +15,9 @@ from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera
 from gknet.io.image import read_image
+from gknet.io.spacecraft_file import load_spacecraft
 from gknet.io.text import read_json
-from gknet.spacecraft import Spacecraft, load_spacecraft
+from gknet.spacecraft import Spacecraft
 
 SAME_POINT_M = 1e-3
 """Keypoints of one spacecraft may differ by rounding between its files, by no more than this."""

@@ -21,8 +21,8 @@ from gknet.evaluation.metrics import nees
 from gknet.frame import Box, Estimate, Frame, Keypoints
 from gknet.inference.crop import Crop
 from gknet.inference.decode import Decoding
-from gknet.inference.estimator import Estimator
-from gknet.inference.locate import check_image
+from gknet.inference.keypoint_estimator import KeypointEstimator
+from gknet.inference.network_io import check_image
 
 STUDENT_DOF = 4.0
 """Of the Student distribution that is fitted: its tails leave room for swaps, which are outliers of the pose."""
@@ -49,12 +49,12 @@ class CalibrationSample:
         floor = (decoding.floor_cells / self.cells_per_px) ** 2 * np.eye(2)
         return replace(self.keypoints, covariance_px2=decoding.spread_scale * self.keypoints.covariance_px2 + floor)
 
-    def estimate(self, estimator: Estimator) -> Estimate:
+    def estimate(self, estimator: KeypointEstimator) -> Estimate:
         """The pose, without running the network again."""
         return estimator.pose_of(self.decoded(estimator.decoding), self.frame.camera, self.box, self.crop)
 
 
-def collect_sample(frame: Frame, bare: Estimator, stride: float) -> CalibrationSample:
+def collect_sample(frame: Frame, bare: KeypointEstimator, stride: float) -> CalibrationSample:
     """Look at a frame with an estimator whose decoding is UNCALIBRATED; `stride` is its network's."""
     box = frame.true_box(bare.spacecraft.points_m)
     if box is None:
@@ -64,7 +64,7 @@ def collect_sample(frame: Frame, bare: Estimator, stride: float) -> CalibrationS
     return CalibrationSample(replace(frame, image=None), box, crop, keypoints, crop.scale / stride)
 
 
-def calibrated(estimator: Estimator, samples: Sequence[CalibrationSample]) -> Estimator:
+def calibrated(estimator: KeypointEstimator, samples: Sequence[CalibrationSample]) -> KeypointEstimator:
     """The estimator with a decoding and a covariance scale that fit its errors in `samples`."""
     points_m = estimator.spacecraft.points_m
     errors, spreads = [], []

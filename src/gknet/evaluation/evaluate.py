@@ -15,9 +15,8 @@ from numpy import ndarray
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import FrameErrors, Summary, compute_errors, keypoint_errors_px, oracle_crop, summarise
-from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints, Unreadable
+from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints, PoseEstimator, Unreadable
 from gknet.inference.crop import Crop
-from gknet.inference.locate import CropEstimator
 from gknet.spacecraft import Spacecraft
 
 Protocol = Literal["oracle", "detected"]
@@ -142,7 +141,7 @@ def keypoint_statistics(run: ProtocolRun, k: int) -> KeypointStatistics:
 
 def evaluate(
     dataset: SkdDataset,
-    estimator: CropEstimator,
+    estimator: PoseEstimator,
     protocols: Sequence[Protocol] = ("oracle", "detected"),
     data: str = "",
     on_frame: Callable[[], None] = lambda: None,
@@ -181,7 +180,7 @@ def _judged_frame(dataset: SkdDataset, index: int, spacecraft: Spacecraft) -> Fr
     return Unreadable(name, Failure(FailureKind.NO_KEYPOINT_IN_VIEW, f"frame {frame.name}: no keypoint is in view"))
 
 
-def _case(index: int, frame: Frame, sequence: str, estimator: CropEstimator, protocol: Protocol) -> Case:
+def _case(index: int, frame: Frame, sequence: str, estimator: PoseEstimator, protocol: Protocol) -> Case:
     spacecraft = estimator.spacecraft
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: an evaluation needs its image")

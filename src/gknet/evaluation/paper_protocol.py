@@ -16,7 +16,7 @@ from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
-from gknet.inference.locate import KeypointNetwork, check_image, network_input
+from gknet.inference.network_io import KeypointForward, check_image, network_input
 from gknet.spacecraft import Spacecraft
 
 CELLS = 32
@@ -30,9 +30,14 @@ class PaperEstimator:
     keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride)
     """
 
-    keypoint_network: KeypointNetwork
+    keypoint_network: KeypointForward
     spacecraft: Spacecraft
     input_size: int = 256
+
+    @property
+    def has_locator(self) -> bool:
+        """Never: the crops are made of the annotations."""
+        return False
 
     def estimate(self, image: UInt8[ndarray, "h w *c"], camera: Camera, box: Box | None = None) -> Estimate:
         """The pose without a covariance. Any pose that the solver returns counts, as in the paper."""

@@ -10,7 +10,8 @@ from importlib import import_module
 from pathlib import Path
 
 from gknet.errors import GknetError, MissingExtraError
-from gknet.spacecraft import Spacecraft, load_spacecraft
+from gknet.io.spacecraft_file import load_spacecraft
+from gknet.spacecraft import Spacecraft
 
 NAMES = ("satellite_01", "satellite_02", "satellite_03")
 

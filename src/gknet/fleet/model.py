@@ -17,7 +17,8 @@ from trimesh.visual import TextureVisuals
 from gknet.fleet.materials import Material
 from gknet.fleet.shapes import Point, joined, point_of
 from gknet.io.atomic import write_bytes
-from gknet.spacecraft import Spacecraft, Symmetry, diameter, save_spacecraft
+from gknet.io.spacecraft_file import save_spacecraft
+from gknet.spacecraft import Spacecraft, Symmetry, diameter
 
 CREASE_RAD = np.deg2rad(35)
 """Faces that meet at less than this angle are shaded as one smooth surface."""

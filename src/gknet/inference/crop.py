@@ -1,6 +1,6 @@
 """The map between an image and a network's square input, used both ways.
 
-A crop has whole-pixel corners, so cutting it out and resizing it is pure scaling: no half-pixel shift can creep in.
+A crop has whole-pixel corners, so cutting it out and resizing it is pure scaling, without a half-pixel shift.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Crop:
     It may reach beyond the image; what lies outside is black.
 
     Attributes:
-        x0: Left side in whole px of the image.
-        y0: Top side in whole px of the image.
-        side: Length of a side in px of the image.
-        size: Length of a side in px of the network's input.
+        x0: left edge in image pixels.
+        y0: top edge in image pixels.
+        side: side in image pixels.
+        size: side in pixels of the network's input.
     """
 
     x0: int
@@ -43,10 +43,21 @@ class Crop:
 
     @staticmethod
     def around(box: Box, size: int, margin: float = CROP_MARGIN) -> Crop:
-        """The square about `box`, its side `margin` times the longer side of the box, for an input of `size` px."""
+        """The square about a box.
+
+        Args:
+            box: in image pixels.
+            size: side in pixels of the network's input.
+            margin: side of the square over the longer side of the box.
+        """
         side = max(8, round(box.side * margin))
         centre_x, centre_y = box.centre
         return Crop(round(centre_x - side / 2), round(centre_y - side / 2), side, size)
+
+    @property
+    def box(self) -> Box:
+        """The square in image pixels."""
+        return Box(self.x0, self.y0, self.x0 + self.side, self.y0 + self.side)
 
     @property
     def scale(self) -> float:
@@ -55,29 +66,49 @@ class Crop:
 
     @property
     def input_from_image(self) -> Float[ndarray, "3 3"]:
-        """(3, 3) affine map from pixels of the image to pixels of the input."""
+        """Homogeneous image pixels to pixels of the input."""
         s = self.scale
         return np.array([[s, 0, -s * self.x0], [0, s, -s * self.y0], [0, 0, 1]], dtype=np.float64)
 
     def to_input(self, pixels: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """(..., 2) pixels of the image, in pixels of the input."""
+        """Image pixels to pixels of the input."""
         return (np.asarray(pixels) - (self.x0, self.y0)) * self.scale
 
     def to_image(self, pixels: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """(..., 2) pixels of the input, in pixels of the image."""
+        """Pixels of the input to image pixels."""
         return np.asarray(pixels) / self.scale + (self.x0, self.y0)
 
     def cut(self, image: UInt8[ndarray, "h w c"]) -> UInt8[ndarray, "size size c"]:
-        """The (size, size, c) crop of an (h, w, c) image: area-averaged when it shrinks, linear when it grows."""
-        height, width = image.shape[:2]
+        """The crop of an image: area-averaged when it shrinks, linear when it grows, black outside.
+
+        Where the crop reaches beyond the image, the longer axis of the part inside is shrunk before the other one is
+        padded. So the memory is a small multiple of the image's, however long and thin it is.
+        """
+        height, width, channels = image.shape
         x0, y0 = max(self.x0, 0), max(self.y0, 0)
         x1, y1 = min(self.x0 + self.side, width), min(self.y0 + self.side, height)
         if x1 <= x0 or y1 <= y0:
-            return np.zeros((self.size, self.size, image.shape[2]), dtype=np.uint8)
+            return np.zeros((self.size, self.size, channels), dtype=np.uint8)
         inside = image[y0:y1, x0:x1]
-        if inside.shape[:2] != (self.side, self.side):
-            left, top = x0 - self.x0, y0 - self.y0
-            right, bottom = self.x0 + self.side - x1, self.y0 + self.side - y1
-            inside = cv2.copyMakeBorder(inside, top, bottom, left, right, cv2.BORDER_CONSTANT)
+        rows = (y0 - self.y0, self.y0 + self.side - y1)
+        columns = (x0 - self.x0, self.x0 + self.side - x1)
+        if not (any(rows) or any(columns)) or self.side <= self.size:
+            return self._resized(_padded(inside, rows, columns), self.size, self.size)
+        if x1 - x0 >= y1 - y0:
+            shrunk = self._resized(_padded(inside, (0, 0), columns), self.size, y1 - y0)
+            return self._resized(_padded(shrunk, rows, (0, 0)), self.size, self.size)
+        shrunk = self._resized(_padded(inside, rows, (0, 0)), x1 - x0, self.size)
+        return self._resized(_padded(shrunk, (0, 0), columns), self.size, self.size)
+
+    def _resized(self, image: UInt8[ndarray, "h w c"], width: int, height: int) -> UInt8[ndarray, "height width c"]:
         method = cv2.INTER_AREA if self.side > self.size else cv2.INTER_LINEAR
-        return cv2.resize(inside, (self.size, self.size), interpolation=method).reshape(self.size, self.size, -1)
+        return cv2.resize(image, (width, height), interpolation=method).reshape(height, width, -1)
+
+
+def _padded(image: UInt8[ndarray, "h w c"], rows: tuple[int, int], columns: tuple[int, int]) -> UInt8[ndarray, "*hwc"]:
+    """With black rows above and below, and black columns left and right."""
+    if not (any(rows) or any(columns)):
+        return image
+    return cv2.copyMakeBorder(image, *rows, *columns, cv2.BORDER_CONSTANT).reshape(
+        image.shape[0] + sum(rows), image.shape[1] + sum(columns), -1
+    )

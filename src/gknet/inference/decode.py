@@ -1,10 +1,10 @@
-"""Heatmaps to keypoints, below the cell, each with a covariance; and the locator's maps to a box.
+"""Heatmaps to keypoints with sub-cell precision, each with a covariance.
 
-A heatmap is the target Gaussian averaged over what the network deems possible: training by squared error tends to it,
-training by likelihood says it outright (decision 0007).
-If that spread has covariance C and the peak value is p, then the heatmap's own local covariance M is the target's
-plus C, and for a round spread C = M (1 - p). So peak and width together tell how far the keypoint may be off. Here
-C = M (1 - p) / p + floor: equal to it near p = 1, and wider where a low peak says that mass sits elsewhere.
+A heatmap is the target Gaussian averaged over the positions that the network considers possible: training by squared
+error tends to it, training by likelihood states it (decision 0007). If the positions have the covariance C and the peak
+is p, then the heatmap's own local covariance M is the target's plus C, and for a round distribution C = M (1 - p). So
+the peak's height and width together determine how far the keypoint may be off. Here C = M (1 - p) / p + floor: equal to
+it near p = 1, and wider where a low peak means that probability lies elsewhere.
 """
 
 from __future__ import annotations
@@ -16,46 +16,55 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Keypoints
+from gknet.frame import Keypoints
 from gknet.inference.crop import Crop
 
 RADIUS = 2
-"""The fit sees the (2 RADIUS + 1)^2 cells about the highest one."""
+"""The fit uses the (2 RADIUS + 1)^2 cells about the highest one."""
 
 NO_PEAK = 0.02
 """A heatmap that rises less than this above its median has no peak."""
 
 SPREAD_CELLS = 1.5
-"""The width of a training target: the fit leans to it, and takes it where it finds no width of its own."""
+"""Standard deviation of a training target: the prior of the fitted width, and the width where the fit finds none."""
 
-LEANING = 0.1
-"""Weight of that width against the cells, of which the highest has weight 1. It steadies peaks at the border."""
+WIDTH_PRIOR = 0.1
+"""Weight of that prior against the cells, of which the highest has weight 1. It steadies peaks at the border."""
 
 
 @dataclass(frozen=True)
 class Decoding:
-    """How sure a peak is believed to be.
+    """How a peak's height and width become a covariance. Both numbers are fitted on a validation split (calibration).
 
-    floor_cells   standard deviation per axis of a perfect peak
-    spread_scale  multiplies the covariance that a peak's height and width tell
-    Both are fitted on a validation split (calibration.py).
+    Attributes:
+        floor_cells: standard deviation per axis of a perfect peak, in cells of the heatmap.
+        spread_scale: factor on the covariance that follows from a peak's height and width.
     """
 
     floor_cells: float = 0.3
     spread_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (self.floor_cells > 0 and self.spread_scale > 0):
+        if not (0 < self.floor_cells < np.inf and 0 < self.spread_scale < np.inf):
             raise GknetError(
-                f"decoding: expected a positive floor and scale, got {self.floor_cells} and {self.spread_scale}"
+                f"decoding: expected a positive, finite floor and scale, got {self.floor_cells} and {self.spread_scale}"
             )
 
 
 def decode_heatmaps(heatmaps: Float[ndarray, "n h w"], stride: float, decoding: Decoding | None = None) -> Keypoints:
-    """One keypoint per heatmap, in pixels of the network's input.
+    """One keypoint per heatmap.
 
-    A heatmap without a peak (flat, or not finite) yields score 0, the centre of the input and the covariance of a
-    point that may be anywhere in it.
+    Args:
+        heatmaps: (n, h, w), h and w of 3 or more.
+        stride: pixels of the network's input per cell.
+        decoding: how a peak becomes a covariance; None for the uncalibrated default.
+
+    Returns:
+        Keypoints in pixels of the network's input. A heatmap without a peak (flat, or not finite) yields score 0, the
+        centre of the input and the covariance of a point that may be anywhere in it.
+
+    Raises:
+        GknetError: the heatmaps have another shape.
     """
     decoding = decoding or Decoding()
     if heatmaps.ndim != 3 or heatmaps.shape[1] < 3 or heatmaps.shape[2] < 3:
@@ -81,34 +90,6 @@ def decode_heatmaps(heatmaps: Float[ndarray, "n h w"], stride: float, decoding: 
 def keypoints_to_image(keypoints: Keypoints, crop: Crop) -> Keypoints:
     """From pixels of a crop's network input to pixels of the image it was cut from."""
     return Keypoints(crop.to_image(keypoints.pixels), keypoints.score, keypoints.covariance_px2 / crop.scale**2)
-
-
-def decode_locator(
-    output: Float[ndarray, "5 h w"], stride: float, input_size: int, min_score: float = 0.1
-) -> tuple[Box, float] | None:
-    """The locator's box in pixels of its input, with the score of its peak; None when it sees no spacecraft.
-
-    Channel 0 is the heatmap of the box's centre, channels 1 to 4 the distances from a cell's centre to the left,
-    top, right and bottom side, in units of the input's size. The sides are averaged over the cells about the peak.
-    """
-    if output.ndim != 3 or output.shape[0] != 5:
-        raise GknetError(f"locator output: expected shape (5, h, w), got {output.shape}")
-    if not np.isfinite(output).all():
-        return None
-    heat = np.maximum(output[0], 0)
-    row, column = np.unravel_index(int(heat.argmax()), heat.shape)
-    score = float(min(heat[row, column], 1.0))
-    if score < min_score:
-        return None
-    window = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    y, x = (np.mgrid[: heat.shape[0], : heat.shape[1]] + 0.5)[(slice(None), *window)] * stride
-    weight = heat[window] / heat[window].sum()
-    left, top, right, bottom = np.maximum(output[1:][(slice(None), *window)], 0) * input_size
-    x0, y0 = float((weight * (x - left)).sum()), float((weight * (y - top)).sum())
-    x1, y1 = float((weight * (x + right)).sum()), float((weight * (y + bottom)).sum())
-    if x1 - x0 < 1e-3 or y1 - y0 < 1e-3:
-        return None
-    return Box(x0, y0, x1, y1), score
 
 
 def _median(heatmaps: Float[ndarray, "n h w"]) -> Float[ndarray, " n"]:
@@ -144,10 +125,10 @@ def _fit(
     basis = np.stack([np.ones(len(dx)), dx, dy, dx * dx / 2, dx * dy, dy * dy / 2], axis=1)
     weight = np.where(positive, values / np.maximum(top, NO_PEAK)[:, None], 0.0) ** 2
     expected = np.array([0, 0, 0, -1, 0, -1]) / SPREAD_CELLS**2
-    leaning = np.array([1e-9, 1e-9, 1e-9, LEANING, LEANING, LEANING])
+    prior = np.array([1e-9, 1e-9, 1e-9, WIDTH_PRIOR, WIDTH_PRIOR, WIDTH_PRIOR])
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    normal = (weight @ products).reshape(-1, 6, 6) + np.diag(leaning)
-    right = (weight * np.log(values)) @ basis + leaning * expected
+    normal = (weight @ products).reshape(-1, 6, 6) + np.diag(prior)
+    right = (weight * np.log(values)) @ basis + prior * expected
     coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
     return _summit(coefficients, top, weight @ np.stack([dx, dy], axis=1) / np.maximum(weight.sum(1), 1e-9)[:, None])
 

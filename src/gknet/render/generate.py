@@ -24,6 +24,7 @@ from gknet.geometry import Camera
 from gknet.inference.crop import Crop
 from gknet.io.atomic import write_text
 from gknet.io.image import is_whole_jpeg
+from gknet.io.spacecraft_file import load_spacecraft
 from gknet.io.text import read_json
 from gknet.render.contact_sheet import write_contact_sheet
 from gknet.render.plan import (
@@ -39,7 +40,6 @@ from gknet.render.render_log import Progress
 from gknet.render.scenario import CAMERA, Recipe, load_recipe
 from gknet.render.scene import choose_variant
 from gknet.render.worker import JOURNAL, Outcome, WorkerState, read_journal, render_chunk, start_worker, worker_chunk
-from gknet.spacecraft import load_spacecraft
 
 CHUNK = 8
 """Frames a worker takes at a time."""

@@ -18,12 +18,13 @@ from gknet.dataset.skd_format import Annotation, category_of, row_of, sequence_n
 from gknet.dataset.skd_write import write_frame_files
 from gknet.geometry import Camera
 from gknet.inference.crop import Crop
+from gknet.io.spacecraft_file import load_spacecraft
 from gknet.render.background import background
 from gknet.render.plan import Options, SequencePlan, spacecraft_path, window_of
 from gknet.render.scenario import Shot, shoot
 from gknet.render.scene import Renderer
 from gknet.render.sensor import expose
-from gknet.spacecraft import Spacecraft, load_spacecraft
+from gknet.spacecraft import Spacecraft
 
 JOURNAL = "journal.jsonl"
 """Label rows of a sequence under way, one JSON line a frame; annotations.csv takes its place at the end."""

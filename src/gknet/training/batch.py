@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from gknet.inference.direct_estimator import CropPose
+from gknet.inference.crop_pose import CropPose
 from gknet.training.augment import (
     Augmentation,
     PictureAugmentation,

@@ -18,7 +18,7 @@ from numpy import ndarray
 from gknet.errors import GknetError
 from gknet.frame import Box, Frame
 from gknet.inference.crop import Crop
-from gknet.inference.direct_estimator import CropPose, has_square_pixels
+from gknet.inference.crop_pose import CropPose, has_square_pixels
 from gknet.spacecraft import Spacecraft
 
 CACHE_MARGIN = 1.6

@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from jaxtyping import Float, Float32
 from numpy import ndarray
@@ -25,13 +24,14 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from gknet.errors import GknetError
 from gknet.inference.onnx_model import METADATA_KEY
+from gknet.inference.onnx_session import open_session
 from gknet.io.atomic import write_bytes
+from gknet.io.spacecraft_file import spacecraft_from_toml
 from gknet.network.backbone import ConvNorm
 from gknet.network.build import Network, build
 from gknet.network.dmanet import DMANet
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.network.locator import Locator
-from gknet.spacecraft import spacecraft_from_toml
 from gknet.training.checkpoint import BEST, load_weights, save_weights
 from gknet.training.settings import TrainingRun, load_run
 
@@ -161,9 +161,7 @@ def in_rows(outputs: Sequence[ndarray]) -> Float32[ndarray, "b m"]:
 
 def run_onnx(model: bytes, images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "2 b m"]:
     """The answers to the pictures one by one, and to all of them together."""
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    session = open_session(model)
     alone = np.concatenate([in_rows(session.run(None, {"image": image[None]})) for image in images])
     together = in_rows(session.run(None, {"image": images}))
     if alone.shape != together.shape:

@@ -16,9 +16,9 @@ import torch
 from gknet import __version__
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import DivergedError, GknetError
+from gknet.io.spacecraft_file import spacecraft_toml
 from gknet.network.build import build
 from gknet.network.locator import Locator
-from gknet.spacecraft import spacecraft_toml
 from gknet.training.batch import Loader
 from gknet.training.checkpoint import (
     BEST,

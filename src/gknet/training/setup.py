@@ -12,7 +12,7 @@ from torch import nn
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.inference.attitude import AttitudeBins
-from gknet.inference.direct_estimator import has_square_pixels
+from gknet.inference.crop_pose import has_square_pixels
 from gknet.network.dmanet import DMANet
 from gknet.network.locator import Locator
 from gknet.network.network import Network

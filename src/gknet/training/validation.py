@@ -16,10 +16,11 @@ from gknet.evaluation import metrics
 from gknet.evaluation.calibration import UNCALIBRATED, calibrated, collect_sample
 from gknet.frame import Frame
 from gknet.inference.attitude import AttitudeBins
+from gknet.inference.crop_estimator import InferenceSettings
 from gknet.inference.decode import Decoding
 from gknet.inference.direct_estimator import DirectEstimator
-from gknet.inference.estimator import Estimator
-from gknet.inference.locate import InferenceSettings, NetworkOutput
+from gknet.inference.keypoint_estimator import KeypointEstimator
+from gknet.inference.network_io import NetworkOutput
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
 
@@ -85,7 +86,9 @@ def validate_keypoints(
     network.eval()
     settings = InferenceSettings(input_size=input_size)
     run = numpy_network(network, device)
-    bare = Estimator(lambda images: NetworkOutput(run(images)), spacecraft, settings=settings, decoding=UNCALIBRATED)
+    bare = KeypointEstimator(
+        lambda images: NetworkOutput(run(images)), spacecraft, settings=settings, decoding=UNCALIBRATED
+    )
     samples = [collect_sample(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
     try:
         estimator = calibrated(bare, samples)
@@ -144,7 +147,7 @@ def validate_locator(
     """Overlap of the located with the true boxes; the score is 1 minus the part that reaches 0.7, plus the mean gap."""
     network.eval()
     run = numpy_network(network, device)
-    estimator = Estimator(
+    estimator = KeypointEstimator(
         lambda images: NetworkOutput(run(images)),
         spacecraft,
         locator=run,

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import gknet.inference.estimator as estimating
+import gknet.inference.keypoint_estimator as estimating
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import compute_errors
 from gknet.frame import Box, Failure, FailureKind, Frame
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop import Crop
-from gknet.inference.decode import Decoding
-from gknet.inference.direct_estimator import attitude_seen
-from gknet.inference.estimator import Estimator, load_estimator, shipped_models
-from gknet.inference.locate import InferenceSettings, NetworkOutput, check_image
+from gknet.inference.crop_estimator import InferenceSettings
+from gknet.inference.crop_pose import allocentric_wxyz
+from gknet.inference.keypoint_estimator import KeypointEstimator
+from gknet.inference.network_io import NetworkOutput
 from gknet.inference.pnp import PnpResult, PnpSettings
-from gknet.spacecraft import Spacecraft, spacecraft_toml
-from tests.inference.test_decode import gaussians, locator_output
+from gknet.spacecraft import Spacecraft
+from tests.inference.test_decode import gaussians
+from tests.inference.test_locator import locator_output
 
 POINTS = np.random.default_rng(7).uniform(-1, 1, (14, 3)) * (3, 1, 1)
 CRAFT = Spacecraft("probe", tuple(f"k{i}" for i in range(14)), POINTS, ((0, 1), (1, 2)), 6.5)
@@ -86,14 +85,16 @@ class PerfectLocator(PerfectNetwork):
         return locator_output((x0, y0, x1, y1))[None]
 
 
-def perfect(pose: Pose, swapped: int = 0, **settings: object) -> tuple[Estimator, Frame]:
+def perfect(pose: Pose, swapped: int = 0, **settings: object) -> tuple[KeypointEstimator, Frame]:
     blank = Frame("chart", None, CAMERA, pose)
     box = blank.true_box(POINTS)
     assert box is not None
     chart = Chart(CAMERA, box)
     network = PerfectNetwork(blank.keypoints_px(POINTS), chart, swapped)
     locator = PerfectLocator(np.array([[box.x0, box.y0], [box.x1, box.y1]]), chart)
-    return Estimator(network, CRAFT, locator, InferenceSettings(**settings)), replace(blank, image=chart.image())
+    return KeypointEstimator(network, CRAFT, locator, InferenceSettings(**settings)), replace(
+        blank, image=chart.image()
+    )
 
 
 POSES = {
@@ -134,7 +135,7 @@ def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
         return NetworkOutput(np.repeat(maps, 14, axis=1).astype(np.float32))
 
     for tta_rotations, place in ((1, (30, 22)), (2, (170, 80)), (4, (170, 80))):
-        estimator = Estimator(network, CRAFT, settings=InferenceSettings(tta_rotations=tta_rotations))
+        estimator = KeypointEstimator(network, CRAFT, settings=InferenceSettings(tta_rotations=tta_rotations))
         found, _ = estimator.detect(image, Crop(0, 0, 256, 256))
         np.testing.assert_allclose(found.pixels, [place] * 14, atol=0.2)
         assert found.score.min() > 0.7  # every view says so
@@ -143,7 +144,7 @@ def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
 
 def test_other_orientations_than_quarter_turns_are_refused() -> None:
     with pytest.raises(GknetError, match="1, 2 or 4"):
-        load_estimator("satellite_01", tta_rotations=3)
+        InferenceSettings(tta_rotations=3)
 
 
 def test_a_box_that_the_keypoints_contradict_has_no_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,7 +218,7 @@ def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
     assert estimator.estimate(frame.image, CAMERA, box).attitude_confidence is None
     twin = pose @ Pose.from_rotation_vector([0, 0, math.pi], [0, 0, 0])
     for believed, low, high in ((pose, 0.95, 1.0), (twin, 0.0, 0.05)):
-        label = bins.soft_label(attitude_seen(believed))[None].astype(np.float32)
+        label = bins.soft_label(allocentric_wxyz(believed))[None].astype(np.float32)
         sure = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=label), bins=bins)  # noqa: B023
         estimate = sure.estimate(frame.image, CAMERA, box)
         assert estimate.cam_from_body is not None
@@ -230,13 +231,15 @@ def test_failures_are_values_with_reasons() -> None:
     estimator, frame = perfect(POSES["middle"])
     outside = estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50))
     assert outside.failure == Failure(FailureKind.BOX_OUTSIDE_IMAGE, "the box lies outside the image")
-    blind = Estimator(lambda images: NetworkOutput(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
+    blind = KeypointEstimator(lambda images: NetworkOutput(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
     estimate = blind.estimate(frame.image, CAMERA, frame.true_box(POINTS))
     assert estimate.failure is not None
     assert estimate.failure.kind == FailureKind.TOO_FEW_KEYPOINTS
     assert "0 keypoints" in str(estimate.failure)
     assert estimate.keypoints is not None
-    lost = Estimator(estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32))
+    lost = KeypointEstimator(
+        estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32)
+    )
     not_found = lost.estimate(frame.image, CAMERA)
     assert not_found.failure == Failure(FailureKind.NO_SPACECRAFT, "the locator finds no spacecraft")
 
@@ -268,46 +271,10 @@ def test_thresholds_are_in_pixels_of_the_input() -> None:
         return NetworkOutput(gaussians((network.truth_in(images) + jitter) / 4)[None])
 
     strict = PnpSettings(threshold_px=(6.0,), min_inlier_fraction=0.9)
-    estimate = Estimator(jittered, CRAFT, pnp=strict).estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    estimate = KeypointEstimator(jittered, CRAFT, pnp=strict).estimate(frame.image, CAMERA, frame.true_box(POINTS))
     assert estimate.failure is None
     assert estimate.reprojection_rms_px is not None
     assert estimate.reprojection_rms_px > 3
-
-
-def test_the_locator_sees_the_whole_frame_in_the_middle() -> None:
-    views = []
-
-    def locator(images: np.ndarray) -> np.ndarray:
-        views.append(images[0])
-        return np.zeros((1, 5, 64, 64), dtype=np.float32)
-
-    image = np.full((100, 200, 3), 255, dtype=np.uint8)
-    assert Estimator(NetworkOutput, CRAFT, locator).locate(image) is None
-    lit = views[0][0] > 0.5
-    assert lit[64:192].all()
-    assert not lit[:64].any()
-    assert not lit[192:].any()
-
-
-def test_grey_is_read_as_rgb() -> None:
-    grey = np.random.default_rng(0).integers(0, 255, (20, 30), dtype=np.uint8)
-    assert (check_image(grey) == grey[:, :, None]).all()
-    assert check_image(grey).shape == (20, 30, 3)
-
-
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.zeros((20, 30, 4), dtype=np.uint8),
-        np.zeros((20, 30, 3), dtype=np.float32),
-        np.zeros((0, 30, 3), dtype=np.uint8),
-        np.zeros(5, dtype=np.uint8),
-        None,
-    ],
-)
-def test_other_images_are_refused(image: object) -> None:
-    with pytest.raises(GknetError, match="image"):
-        check_image(image)
 
 
 def test_bad_use_is_refused() -> None:
@@ -315,41 +282,11 @@ def test_bad_use_is_refused() -> None:
     with pytest.raises(GknetError, match="800 x 640"):
         estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
     with pytest.raises(GknetError, match="give a box"):
-        Estimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
+        KeypointEstimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
     see = estimator.keypoint_network
     few = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=np.ones((1, 4), np.float32)))
     with pytest.raises(GknetError, match="864 classes of attitude, got 4"):
         replace(few, bins=AttitudeBins(12)).estimate(frame.image, CAMERA, frame.true_box(POINTS))
-    wrong = Estimator(lambda images: NetworkOutput(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
+    wrong = KeypointEstimator(lambda images: NetworkOutput(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
     with pytest.raises(GknetError, match="14 heatmaps"):
         wrong.estimate(frame.image, CAMERA, frame.true_box(POINTS))
-
-
-def test_load_from_a_folder(tmp_path: Path) -> None:
-    pytest.importorskip("onnx")
-    from tests.inference.test_onnx_model import METADATA, write_pool
-
-    keypoints = METADATA | {
-        "input_size": 32,
-        "floor_cells": 0.4,
-        "spread_scale": 2.0,
-        "pose_scale": 1.5,
-        "spacecraft": spacecraft_toml(CRAFT),
-    }
-    write_pool(tmp_path / "keypoints.onnx", json.dumps(keypoints), size=32)
-    estimator = load_estimator(tmp_path, threads=1)
-    assert estimator.locator is None
-    assert estimator.spacecraft.name == "probe"
-    assert estimator.settings.input_size == 32
-    assert estimator.decoding == Decoding(floor_cells=0.4, spread_scale=2.0)
-    assert estimator.pnp.covariance_scale == 1.5
-    write_pool(tmp_path / "locator.onnx", json.dumps(keypoints), size=32)
-    with pytest.raises(GknetError, match="kind 'locator'"):
-        load_estimator(tmp_path)
-
-
-def test_unknown_model_lists_what_exists(tmp_path: Path) -> None:
-    with pytest.raises(GknetError, match="shipped model") as caught:
-        load_estimator(tmp_path / "none")
-    for name in shipped_models():
-        assert name in str(caught.value)
