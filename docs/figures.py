@@ -411,9 +411,9 @@ def block(
         lw=0.9,
     )
     axes.add_patch(shape)
-    note(axes, x, y + (0.09 * (1 + under.count("\n")) if under else 0), title, fontsize=8.6, fontweight="bold")
+    note(axes, x, y + (0.09 * (1 + under.count("\n")) if under else 0), title, fontsize=9.4, fontweight="bold")
     if under:
-        note(axes, x, y - 0.1, under, fontsize=7.4)
+        note(axes, x, y - 0.1, under, fontsize=8.3)
 
 
 def pipeline() -> Figure:
@@ -500,24 +500,24 @@ def architecture() -> Figure:
     arrow(axes, (4.5, 3.85), (4.55, 3.32))
     axes.plot([7.6, 7.6, 1.6], [3.86, 3.66, 3.66], color=GREEN, lw=1.3)
     arrow(axes, (1.6, 3.66), (1.6, 3.31), GREEN)
-    note(axes, 6.1, 3.76, "added to the maps", color=GREEN, fontsize=7.6)
+    note(axes, 6.1, 3.76, "added to the maps", color=GREEN, fontsize=8.4)
     arrow(axes, (2.38, row3), (3.32, row3))
-    note(axes, 2.72, row3 + 0.13, "where", fontsize=7.6)
+    note(axes, 2.72, row3 + 0.13, "where", fontsize=8.4)
     arrow(axes, (5.88, row3), (6.32, row3))
     axes.plot([7.87, 9.1, 9.1], [row3, row3, row1], color=ORANGE, lw=1.3)
     arrow(axes, (9.1, row1), (8.68, row1), ORANGE)
-    note(axes, 9.2, 3.9, "the first maps\n(pixel + node)\nupdate the\nattitude", color=ORANGE, fontsize=7.6, ha="left")
+    note(axes, 9.2, 3.9, "the first maps\n(pixel + node)\nupdate the\nattitude", color=ORANGE, fontsize=8.4, ha="left")
     arrow(axes, (4.6, 2.49), (4.6, 1.66), INK)
     note(
         axes,
         4.72,
         2.12,
         "sharpened probability of the first maps\n(in training: some keypoints teacher-forced)",
-        fontsize=7.6,
+        fontsize=8.4,
         ha="left",
     )
     arrow(axes, (1.3, 2.5), (1.3, 1.66))
-    note(axes, 1.4, 2.08, "prior of the\nupdated attitude", fontsize=7.6, ha="left", color=GREEN)
+    note(axes, 1.4, 2.08, "prior of the\nupdated attitude", fontsize=8.4, ha="left", color=GREEN)
     arrow(axes, (5.88, second), (6.32, second))
     arrow(axes, (1.3, 0.83), (3.1, 0.35))
     arrow(axes, (7.1, 0.83), (6.1, 0.42))
