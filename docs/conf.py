@@ -50,6 +50,7 @@ html_static_path = ["_static"]
 html_css_files = ["gknet.css"]
 html_show_sourcelink = False
 html_copy_source = False
+html_show_copyright = False
 html_math_renderer = "mathml"
 html_theme_options = {"source_repository": "", "navigation_with_keys": True}
 
