@@ -23,11 +23,12 @@ from scipy.spatial.transform import Rotation
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.render import film
-from gknet.render.materials import build_shapes, read_glb
+from gknet.render.bsdf import build_shapes
+from gknet.render.mesh import read_glb
 from gknet.render.scenario import Sensor, Shot
 from gknet.render.scene import Renderer, choose_variant, light_of
 from gknet.render.variant import load_engine
-from gknet.spacecraft import Spacecraft
+from gknet.spacecraft import Spacecraft, diameter
 
 SENSOR = Sensor(
     psf_sigma_px=0.6,
@@ -92,11 +93,10 @@ def shots(frames: int, span: float, centre_m: ndarray, diameter_m: float) -> lis
 
 def craft_of(mesh: Path) -> Spacecraft:
     """The mesh with 16 of its vertices as keypoints."""
-    vertices = np.concatenate([surface.vertices_m for surface in read_glb(mesh)])
+    vertices = np.concatenate([part.vertices_m for part in read_glb(mesh)])
     points = vertices[np.linspace(0, len(vertices) - 1, 16).astype(int)]
     names = tuple(f"point_{k}" for k in range(16))
-    diameter = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    return Spacecraft(mesh.stem, names, points, ((0, 1),), diameter, mesh_path=mesh)
+    return Spacecraft(mesh.stem, names, points, ((0, 1),), diameter(vertices), mesh_path=mesh)
 
 
 def main(
@@ -110,7 +110,7 @@ def main(
 ) -> None:
     variant = variant or choose_variant()
     craft = craft_of(mesh)
-    vertices = np.concatenate([surface.vertices_m for surface in read_glb(mesh)])
+    vertices = np.concatenate([part.vertices_m for part in read_glb(mesh)])
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     plan = shots(frames + 2, span, centre, craft.diameter_m)
     ours, bare = Renderer(craft, variant, spp, threads), Bare(mesh, variant, size, spp, plan[0])

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from gknet.errors import ends_in_one_line
 from gknet.render.generate import generate
+from gknet.render.options import Options, Selection
 
 TEST_SEQUENCES = {"satellite_01": 7, "satellite_02": 17, "satellite_03": 14}
 """Which of a spacecraft's 20 test sequences: ones with the Earth behind and the craft large enough to look at."""
@@ -28,7 +29,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of what ships; replaced")
     arguments = parser.parse_args()
     for name, place in TEST_SEQUENCES.items():
-        generate("skd", arguments.work, 0, name, "test", first=120, every=4, frames=8, shard=(place, 20), mask=False)
+        chosen = Selection((name,), "test", first=120, every=4, frames=8, shard=(place, 20))
+        generate("skd", arguments.work, Options(mask=False), chosen)
     shutil.rmtree(arguments.out, ignore_errors=True)
     (arguments.out / "spacecraft").mkdir(parents=True)
     for kept in KEPT:

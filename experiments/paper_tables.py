@@ -51,6 +51,7 @@ from gknet.inference.load import load_estimator
 from gknet.inference.onnx_model import OnnxModel
 from gknet.io.atomic import write_text
 from gknet.render.generate import generate
+from gknet.render.options import Options, Selection
 from gknet.training.checkpoint import CHECKPOINT
 from gknet.training.export import export_run
 from gknet.training.loop import train
@@ -203,12 +204,15 @@ def main() -> None:
 
 def render(work: Path, scale: Scale, spacecraft: list[str]) -> None:
     """Crops to train on; whole frames to validate and to judge on."""
-    frames = {"sequences": scale.sequences, "size": scale.size}
+    crops, frames = Options(DATA_SEED, "target"), Options(DATA_SEED, size=scale.size)
     for name in spacecraft:
-        crops = {"sequences": scale.sequences}
-        generate("skd", work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every, **crops)
-        generate("skd", work / "frames", DATA_SEED, name, "val", every=scale.val_every, **frames)
-        generate("skd", work / "frames", DATA_SEED, name, "test", every=scale.test_every, **frames)
+        train, val, test = (
+            Selection((name,), split, scale.sequences, every)
+            for split, every in (("train", scale.crops_every), ("val", scale.val_every), ("test", scale.test_every))
+        )
+        generate("skd", work / "crops", crops, train)
+        generate("skd", work / "frames", frames, val)
+        generate("skd", work / "frames", frames, test)
 
 
 def wait_for(path: Path) -> None:

@@ -37,6 +37,7 @@ from gknet.errors import ends_in_one_line
 from gknet.fleet import NAMES
 from gknet.network.build import build
 from gknet.render.generate import generate
+from gknet.render.options import Options, Selection
 from gknet.render.recipe import RECIPES
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights, save_weights
 from gknet.training.export import export_run
@@ -116,12 +117,17 @@ def render(work: Path, scale: Scale, kinds: tuple[str, ...] = KINDS) -> None:
     """
     longer = RECIPES["skd"].model_copy(update={"sequences": scale.sequences})
     for name in NAMES:
-        generate(longer, work / "crops", DATA_SEED, name, "train", window="target", every=scale.crops_every)
+        train, val, test = (
+            Selection((name,), split, every=every)
+            for split, every in (("train", scale.crops_every), ("val", scale.val_every), ("test", scale.test_every))
+        )
+        generate(longer, work / "crops", Options(DATA_SEED, "target"), train)
         if "locator" in kinds:
-            generate(longer, work / "pictures", DATA_SEED, name, "train", every=scale.pictures_every, size=256)
-        generate("skd", work / "frames", DATA_SEED, name, "val", every=scale.val_every)
-        generate("skd", work / "frames", DATA_SEED, name, "test", every=scale.test_every)
-        generate("skd-hard", work / "hard", DATA_SEED, name, "test", every=scale.test_every)
+            few = replace(train, every=scale.pictures_every)
+            generate(longer, work / "pictures", Options(DATA_SEED, size=256), few)
+        generate("skd", work / "frames", Options(DATA_SEED), val)
+        generate("skd", work / "frames", Options(DATA_SEED), test)
+        generate("skd-hard", work / "hard", Options(DATA_SEED), test)
 
 
 @dataclass(frozen=True)

@@ -99,10 +99,13 @@ class Spacecraft:
 
 
 def diameter(points_m: Float[ndarray, "n 3"]) -> float:
-    """The largest distance between two of the points, which do not lie in one plane."""
-    from scipy.spatial import ConvexHull
+    """The largest distance between two of the points, in m."""
+    from scipy.spatial import ConvexHull, QhullError
 
-    hull = points_m[ConvexHull(points_m).vertices]
+    try:
+        hull = points_m[ConvexHull(points_m).vertices]
+    except QhullError:  # points of one plane have no hull
+        hull = np.unique(points_m, axis=0)
     return float(max(np.linalg.norm(hull - point, axis=1).max() for point in hull))
 
 

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
+from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
-from gknet.spacecraft import Spacecraft
+from gknet.spacecraft import Spacecraft, diameter
 from tests.render.glb import QUAD, QUAD_FACES, QUAD_UV, Glb
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("trimesh")
 
+from gknet.render.mesh import read_glb
 from gknet.render.scenario import EarthView, Sensor, Shot
 from gknet.render.scene import Renderer, choose_variant
 
@@ -59,10 +61,20 @@ def shot(
     )
 
 
-def spacecraft(path: Path | None, points: ndarray | None = None, diameter_m: float = 3.0) -> Spacecraft:
-    points = np.eye(4, 3) if points is None else points
+def spacecraft(path: Path | None, points: ndarray | None = None, diameter_m: float | None = None) -> Spacecraft:
+    """A toy; by default its keypoints lie in the quad, and it is as large as its mesh where that can be read."""
+    points = QUAD / 2 if points is None else points
+    if diameter_m is None:
+        diameter_m = mesh_diameter(path)
     names = tuple(f"point_{k}" for k in range(len(points)))
     return Spacecraft("toy", names, points, ((0, 1),), diameter_m, mesh_path=path)
+
+
+def mesh_diameter(path: Path | None) -> float:
+    try:
+        return diameter(np.concatenate([part.vertices_m for part in read_glb(path or Path("none.glb"))]))
+    except GknetError:
+        return 3.0
 
 
 def quad_renderer(folder: Path, glb: Glb | None = None, variant: str = VARIANT, spp: int = 16) -> Renderer:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,9 @@ from gknet.io.image import read_image, read_mask
 from gknet.io.spacecraft_file import save_spacecraft
 from gknet.render import generate as stage
 from gknet.render import worker
-from gknet.render.plan import FILM_SIZES, Options, Selection, parse_shard, plan_sequences, target_window
+from gknet.render.journal import JOURNAL
+from gknet.render.options import Options, Selection, parse_shard
+from gknet.render.plan import FILM_SIZES, plan_sequences, target_window
 from gknet.render.recipe import Recipe, load_recipe
 from gknet.render.scenario import CAMERA, Sensor, Shot
 from gknet.render.scene import Rendered, Renderer
@@ -104,11 +107,18 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "background", black)
     monkeypatch.setattr(worker, "expose", clip)
     monkeypatch.setattr(fleet, "build", built)
+    monkeypatch.setattr(stage, "load_mesh", lambda spacecraft: [])
 
 
-def run(out: Path, **options: object) -> stage.Generated:
-    chosen = {"recipe": recipe(), "seed": 5, "size": 64, "workers": 1, "variant": "scalar_rgb"} | options
-    return stage.generate(out=out, **chosen)  # type: ignore[arg-type]
+def run(out: Path, **options: Any) -> stage.Generated:
+    """Render with options and a selection by name."""
+    chosen: dict[str, Any] = {"seed": 5, "size": 64} | options
+    by_class = [
+        {field.name: chosen.pop(field.name) for field in fields(kind) if field.name in chosen}
+        for kind in (Options, Selection)
+    ]
+    rest = {"recipe": recipe(), "workers": 1, "variant": "scalar_rgb"} | chosen
+    return stage.generate(out=out, options=Options(**by_class[0]), selection=Selection(**by_class[1]), **rest)
 
 
 def everything(root: Path) -> dict[str, bytes]:
@@ -136,7 +146,7 @@ def test_keypoints_fall_on_their_discs(tmp_path: Path) -> None:
 
 def test_windows_are_black_beyond_the_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "background", lambda shot, window: black(shot, window) + 0.5)
-    run(tmp_path, window="target", size=96, mask=True, sequences=1, frames=1, spacecraft="satellite_01")
+    run(tmp_path, window="target", size=96, mask=True, sequences=1, frames=1, spacecraft=("satellite_01",))
     frame = SkdDataset(tmp_path).frame(0)
     full_from_window = CAMERA.matrix @ np.linalg.inv(frame.camera.matrix)
     y, x = np.mgrid[:96, :96] + 0.5
@@ -164,17 +174,17 @@ def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     drawn = []
     paint = worker.render_frame
 
-    def killed(state: worker.WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
+    def killed(state: worker.WorkerState, name: str, sequence: int, index: int) -> None:
         if len(drawn) == 9:
             raise KeyboardInterrupt
         drawn.append((sequence, index))
-        return paint(state, name, sequence, index)
+        paint(state, name, sequence, index)
 
     monkeypatch.setattr(worker, "render_frame", killed)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "cut", sequences=1)
     assert not list(tmp_path.rglob("*.tmp"))
-    journal = tmp_path / "cut/data/000002" / worker.JOURNAL
+    journal = tmp_path / "cut/data/000002" / JOURNAL
     journal.write_text(journal.read_text()[:-30])  # the last line was cut as well
     (tmp_path / "cut/data/000001/image/000002.jpg").write_bytes(b"\xff\xd8 cut")
     monkeypatch.setattr(worker, "render_frame", paint)
@@ -187,23 +197,23 @@ def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_bad_frame_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paint = worker.render_frame
 
-    def clumsy(state: worker.WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
+    def clumsy(state: worker.WorkerState, name: str, sequence: int, index: int) -> None:
         if index == 3:
             raise GknetError("no light")
-        return paint(state, name, sequence, index)
+        paint(state, name, sequence, index)
 
     monkeypatch.setattr(worker, "render_frame", clumsy)
-    result = run(tmp_path, sequences=1, spacecraft="satellite_03")
+    result = run(tmp_path, sequences=1, spacecraft=("satellite_03",))
     assert result.rendered == 5
     assert result.failures == ("data/000003 frame 3: GknetError: no light",)
     dataset = SkdDataset(tmp_path)
     assert [dataset.extras(i).index for i in range(len(dataset))] == [0, 1, 2, 4, 5]
     monkeypatch.setattr(worker, "render_frame", paint)
-    assert run(tmp_path, sequences=1, spacecraft="satellite_03").rendered == 1
+    assert run(tmp_path, sequences=1, spacecraft=("satellite_03",)).rendered == 1
 
 
 def test_a_full_disk_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> dict[str, str]:
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(worker, "render_frame", full)
@@ -264,7 +274,7 @@ def test_bad_selections_are_named(selection: dict) -> None:
 
 @pytest.mark.parametrize("option", [{"window": "crop"}, {"size": 4}, {"spp": 0}, {"seed": -1}])
 def test_bad_options_are_named(option: dict) -> None:
-    good = Options(recipe(), seed=0, window="frame", size=64, spp=4, mask=True, depth=False)
+    good = Options(size=64, spp=4)
     with pytest.raises(GknetError, match=next(iter(option))):
         replace(good, **option)
 

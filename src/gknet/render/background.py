@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from gknet.geometry import Camera
 from gknet.inference.crop import Crop
-from gknet.render.earth_texture import surface
+from gknet.render.earth_texture import earth_surface
 from gknet.render.scenario import EARTH_RADIUS_M, EarthView, Shot
 from gknet.render.stars import add_stars
 
@@ -156,8 +156,8 @@ def _earth_light(
     glint = _glint(point, direction / np.sqrt(squared)[..., None], sun.astype(np.float32))
     point, sunlight, glint = _double(point), _double(sunlight), _double(glint)
     below = -earth_from_cam @ centre
-    surf = surface(point, below / np.linalg.norm(below), sequence)
-    ground = (surf.albedo + (glint * surf.water)[..., None]) * sunlight
+    ground_below = earth_surface(point, below / np.linalg.norm(below), sequence)
+    ground = (ground_below.albedo + (glint * ground_below.water)[..., None]) * sunlight
     sky = _double(sky)
     if step == 4:
         ground, sky = _double(ground), _double(sky)

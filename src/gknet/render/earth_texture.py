@@ -30,14 +30,14 @@ CLOUD_ALBEDO = 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class EarthSurface:
     """Albedo (linear RGB) of ground and clouds together, and how far it is open water (0 to 1)."""
 
     albedo: Float32[ndarray, "h w 3"]
     water: Float32[ndarray, "h w"]
 
 
-def surface(point: Float32[ndarray, "h w 3"], below: Float[ndarray, "3"], sequence: int) -> Surface:
+def earth_surface(point: Float32[ndarray, "h w 3"], below: Float[ndarray, "3"], sequence: int) -> EarthSurface:
     """The Earth at unit vectors in Earth-fixed axes; the weather is the sequence's.
 
     `below` is the point below the camera.
@@ -56,7 +56,7 @@ def surface(point: Float32[ndarray, "h w 3"], below: Float[ndarray, "3"], sequen
     water = np.clip((blue - 1.25 * red) * 60, 0, 1) * np.clip(1 - 4 * red, 0, 1) * (1 - cover)
     colours = colours * (1 + np.float32(0.35) * rough)[..., None]
     cloud = np.float32(CLOUD_ALBEDO) * (1 + np.float32(0.22) * rough)
-    return Surface(colours + (cloud[..., None] - colours) * cover[..., None], water)
+    return EarthSurface(colours + (cloud[..., None] - colours) * cover[..., None], water)
 
 
 def _cover(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from gknet.geometry import Camera, Pose
-from gknet.render.shading import Light, sky_radiance
+from gknet.render.shading import IncidentLight, sky_radiance
 from gknet.render.variant import Engine
 
 SUN_SAMPLING = 9.0
@@ -23,7 +23,7 @@ NEAR_M, FAR_M = 0.05, 1e5
 
 
 def radiance(
-    engine: Engine, shapes: dict[str, Any], sensor: dict[str, Any], light: Light, spp: int, seed: int
+    engine: Engine, shapes: dict[str, Any], sensor: dict[str, Any], light: IncidentLight, spp: int, seed: int
 ) -> Float32[ndarray, "s s 4"]:
     """Premultiplied linear RGB and alpha of the whole window."""
     scene = engine.mi.load_dict({"type": "scene", **emitters(engine, light), **shapes})
@@ -82,7 +82,7 @@ def sensor(engine: Engine, camera: Camera, body_from_cam: Pose) -> dict[str, Any
     }
 
 
-def emitters(engine: Engine, light: Light) -> dict[str, Any]:
+def emitters(engine: Engine, light: IncidentLight) -> dict[str, Any]:
     """The sun, and the Earth and the sky as an environment map."""
     sun = {"type": "rgb", "value": [float(np.pi)] * 3}
     sky = sky_radiance(light, _directions(2 * SKY_ROWS)).reshape(SKY_ROWS, 2, 2 * SKY_ROWS, 2, 3).mean(axis=(1, 3))

@@ -1,53 +1,58 @@
-"""The rendering stage: a recipe and a seed -> a dataset on disk. It resumes after a kill, and shards."""
+"""The rendering stage: a recipe and options -> a dataset on disk. It goes on after a kill, and shards."""
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
-import json
-import multiprocessing
-import os
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gknet import fleet
-from gknet.dataset.skd_format import frame_stem, sequence_name
-from gknet.dataset.skd_sequence import read_rows
-from gknet.dataset.skd_write import write_annotations, write_camera_matrix, write_sequence_files, write_splits
+from gknet.dataset.skd_write import write_splits
 from gknet.errors import GknetError, MissingExtraError
-from gknet.geometry import Camera
-from gknet.inference.crop import Crop
-from gknet.io.atomic import write_text
-from gknet.io.image import is_whole_jpeg
-from gknet.io.spacecraft_file import load_spacecraft
-from gknet.io.text import read_json
+from gknet.io.interrupt import Interruption
 from gknet.render.contact_sheet import write_contact_sheet
-from gknet.render.plan import (
-    DEFAULT_SIZE,
-    Options,
-    Selection,
-    SequencePlan,
-    parse_names,
-    plan_sequences,
-    spacecraft_path,
-)
-from gknet.render.render_log import Progress
-from gknet.render.scenario import CAMERA, Recipe, load_recipe
-from gknet.render.scene import choose_variant
-from gknet.render.worker import JOURNAL, Outcome, WorkerState, read_journal, render_chunk, start_worker, worker_chunk
+from gknet.render.folder import claim, finish, folder_lock, load_or_build_spacecraft, prepare
+from gknet.render.mesh import load_mesh
+from gknet.render.options import Options, Selection
+from gknet.render.plan import Job, SequencePlan, plan_sequences
+from gknet.render.pool import MOST_WORKERS, render_chunks
+from gknet.render.recipe import Recipe, load_recipe
+from gknet.render.variant import choose_variant
+from gknet.spacecraft import Spacecraft
 
 CHUNK = 8
 """Frames a worker takes at a time."""
 
 
 @dataclass(frozen=True)
+class Progress:
+    """How far a job is.
+
+    Attributes:
+        total: Frames to render.
+        done: Frames rendered so far.
+        failures: Reasons so far, one for each frame that has no picture.
+        seconds: Since rendering began.
+    """
+
+    total: int
+    done: int
+    failures: tuple[str, ...]
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Generated:
-    """What a run did. `failures` are reasons, one for each frame without a picture."""
+    """What a run did.
+
+    Attributes:
+        out: The dataset's folder.
+        rendered: Frames that are new.
+        kept: Selected frames that were there before.
+        failures: Reasons, one for each frame that has no picture.
+        seconds: Of the whole run.
+    """
 
     out: Path
     rendered: int
@@ -59,67 +64,52 @@ class Generated:
 def generate(
     recipe: str | Path | Recipe,
     out: str | Path,
-    seed: int = 0,
-    spacecraft: str | Sequence[str] | None = None,
-    split: str | None = None,
-    sequences: int | None = None,
-    every: int = 1,
-    first: int = 0,
-    frames: int | None = None,
-    window: str = "frame",
-    size: int | None = None,
-    spp: int = 8,
-    shard: tuple[int, int] = (0, 1),
+    options: Options | None = None,
+    selection: Selection | None = None,
     workers: int = 2,
-    mask: bool | None = None,
-    depth: bool = False,
     variant: str | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
 ) -> Generated:
-    """Render the selected frames of a recipe into the SKD layout at `out`; what is there already is kept.
+    """Render the selected frames of a recipe into the SKD layout; what is there already is kept.
 
-    recipe      a name, a .toml, or a Recipe
-    window      'frame': the whole sensor; 'target': a square around the spacecraft, with its own camera
-    size        pixels of a side (frame: 1024; target: at most 320)
-    sequences, every, first, frames   see `Selection`; another selection may be added to the same folder later
-    workers     processes; 1 renders in this process with all cores
-    mask        write masks (by default for window 'frame' only)
-    variant     Mitsuba's, chosen for the machine by default
+    Ctrl-C, SIGTERM and SIGHUP end the run after the frames that are under way; the same call goes on.
 
-    Raises GknetError when `out` was made with other options. Frames that fail are reported in the result.
+    Args:
+        recipe: A name (skd, skd-hard), the path of a .toml, or a Recipe.
+        out: The dataset's folder. Another selection may be added to it later, and several runs may share it.
+        options: How frames are rendered.
+        selection: Which frames; all by default.
+        workers: Processes; 1 renders in this process with all cores.
+        variant: Mitsuba's, chosen for the machine by default.
+        on_progress: Called at the start and after each chunk of frames.
+
+    Returns:
+        What was done. Frames that failed are reported there.
+
+    Raises:
+        GknetError: `out` was made with other options, the selection has no frame, a mesh is not what its spacecraft's
+            file says, or a worker process died.
+        MissingExtraError: The extra `render` is not installed.
+        Interrupted: A stop signal came.
     """
     _need_mitsuba()
+    if not 1 <= workers <= MOST_WORKERS:
+        raise GknetError(f"workers: expected 1 to {MOST_WORKERS}, got {workers}")
     started = time.monotonic()
-    options = Options(
-        recipe=recipe if isinstance(recipe, Recipe) else load_recipe(recipe),
-        seed=seed,
-        window=window,
-        size=size or DEFAULT_SIZE.get(window, 0) or 1,
-        spp=spp,
-        mask=window == "frame" if mask is None else mask,
-        depth=depth,
-    )
-    selection = Selection(parse_names(spacecraft), split, sequences, every, first, frames, shard)
-    plans = plan_sequences(options.recipe, selection)
-    root = Path(out)
-    root.mkdir(parents=True, exist_ok=True)
-    _claim(root, options)
-    for name in sorted({plan.spacecraft for plan in plans}):
-        _build_spacecraft(root, name)
-    missing = [_prepared(root, options, plan) for plan in plans]
+    job = Job(Path(out), recipe if isinstance(recipe, Recipe) else load_recipe(recipe), options or Options())
+    plans = plan_sequences(job.recipe, selection or Selection())
+    claim(job)
+    fleet = {name: load_or_build_spacecraft(job, name) for name in sorted({plan.spacecraft for plan in plans})}
+    missing = [prepare(job, plan, fleet[plan.spacecraft]) for plan in plans]
     todo = sum(len(plan.indices) for plan in missing)
     kept = sum(len(plan.indices) for plan in plans) - todo
-    failures: list[str] = []
-    open_frames = {plan.sequence: len(plan.indices) for plan in missing}
-    with Progress(todo) as progress:
-        for outcome in _outcomes(root, options, missing, workers, variant or choose_variant()):
-            failures += outcome.failures
-            open_frames[outcome.sequence] -= outcome.done + len(outcome.failures)
-            if open_frames[outcome.sequence] == 0:
-                _finish(root, options, outcome.sequence)
-            progress.add(outcome.done, outcome.failures)
-    write_splits(root, options.recipe.split_of, options.recipe.spacecraft_of)
-    write_contact_sheet(root)
-    return Generated(root, todo - len(failures), kept, tuple(failures), time.monotonic() - started)
+    for name in sorted({plan.spacecraft for plan in missing if plan.indices}):
+        load_mesh(fleet[name])
+    failures = _render(job, missing, fleet, workers, variant or choose_variant(), on_progress) if todo else ()
+    with folder_lock(job.root):
+        write_splits(job.root, job.recipe.split_of, job.recipe.spacecraft_of)
+    write_contact_sheet(job.root)
+    return Generated(job.root, todo - len(failures), kept, failures, time.monotonic() - started)
 
 
 def _need_mitsuba() -> None:
@@ -128,119 +118,34 @@ def _need_mitsuba() -> None:
             raise MissingExtraError("render", module)
 
 
-def _claim(root: Path, options: Options) -> None:
-    """Write recipe.json, or refuse a folder whose recipe.json says otherwise."""
-    path = root / "recipe.json"
-    mine = options.recorded()
-    if not path.exists():
-        if (root / "data").exists():
-            raise GknetError(f"{root}: it holds data that this renderer did not make; choose another folder")
-        write_text(path, json.dumps(mine, indent=1) + "\n")
-    theirs = read_json(path)
-    for key, want in mine.items():
-        have = theirs.get(key) if isinstance(theirs, dict) else None
-        if have != want:
-            names = f"another {key}" if key == "recipe" else f"{key} {have}, not {want}"
-            raise GknetError(
-                f"{root}: it was made with {names} ({path.name}); choose another folder or the same options"
-            )
-
-
-def _build_spacecraft(root: Path, name: str) -> None:
-    """spacecraft/<name>.toml and .glb, where absent: built aside, then moved, so that shards may do it at once."""
-    target = spacecraft_path(root, name)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if target.exists() and target.with_suffix(".glb").exists():
-        return
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{name}.") as folder:
-        fleet.build(name, Path(folder))
-        for suffix in (".glb", ".toml"):
-            os.replace(Path(folder) / f"{name}{suffix}", target.with_suffix(suffix))
-
-
-def _prepared(root: Path, options: Options, plan: SequencePlan) -> SequencePlan:
-    """The plan without the frames that are there; the sequence's small files are written."""
-    folder = root / sequence_name(plan.sequence)
-    done = _rows(root, options, plan.sequence)
-    missing = dataclasses.replace(plan, indices=tuple(i for i in plan.indices if i not in done))
-    if missing.indices and not (folder / "camera_matrix.txt").exists():
-        camera = _whole_camera(options)
-        write_sequence_files(folder, camera, load_spacecraft(spacecraft_path(root, plan.spacecraft)))
-        write_camera_matrix(root / "camera_matrix.txt", camera)
-    if not missing.indices and (folder / JOURNAL).exists():
-        _finish(root, options, plan.sequence)
-    return missing
-
-
-def _whole_camera(options: Options) -> Camera:
-    """The whole sensor's camera, at the size of the pictures when they show all of it."""
-    if options.window == "target":
-        return CAMERA
-    whole = Crop(0, 0, max(CAMERA.width, CAMERA.height), options.size)
-    return CAMERA.warped(whole.input_from_image, whole.size, whole.size)
-
-
-def _rows(root: Path, options: Options, sequence: int) -> dict[int, dict[str, str]]:
-    """The label rows on disk by frame, of those frames whose files are whole."""
-    folder = root / sequence_name(sequence)
-    table = folder / "annotations.csv"
-    rows = [*(read_rows(table) if table.exists() else ()), *read_journal(folder / JOURNAL)]
-    by_frame = {int(row["frame"]): row for row in rows}
-    return {index: row for index, row in by_frame.items() if _is_whole(folder, options, index)}
-
-
-def _is_whole(folder: Path, options: Options, index: int) -> bool:
-    stem = frame_stem(index)
-    return (
-        is_whole_jpeg(folder / "image" / f"{stem}.jpg")
-        and (not options.mask or (folder / "mask" / f"{stem}.png").exists())
-        and (not options.depth or (folder / "depth" / f"{stem}.npz").exists())
-    )
-
-
-def _finish(root: Path, options: Options, sequence: int) -> None:
-    """Turn a sequence's journal into annotations.csv and list the sequence in its split."""
-    folder = root / sequence_name(sequence)
-    rows = _rows(root, options, sequence)
-    if rows:
-        write_annotations(folder, rows.values())
-        write_splits(root, options.recipe.split_of, options.recipe.spacecraft_of)
-    (folder / JOURNAL).unlink(missing_ok=True)
+def _render(
+    job: Job,
+    plans: list[SequencePlan],
+    fleet: dict[str, Spacecraft],
+    workers: int,
+    variant: str,
+    on_progress: Callable[[Progress], None] | None,
+) -> tuple[str, ...]:
+    """Render the frames of the plans, finish each sequence as its last frame comes; the reasons of what failed."""
+    report = on_progress or (lambda progress: None)
+    failures: tuple[str, ...] = ()
+    started, done = time.monotonic(), 0
+    total = sum(len(plan.indices) for plan in plans)
+    spacecraft_of = {plan.sequence: plan.spacecraft for plan in plans}
+    left = {plan.sequence: len(plan.indices) for plan in plans}
+    report(Progress(total, 0, (), 0.0))
+    with Interruption() as interruption:
+        for outcome in render_chunks(job, _chunks(plans), workers, variant, interruption):
+            done, failures = done + outcome.done, failures + outcome.failures
+            left[outcome.sequence] -= outcome.done + len(outcome.failures)
+            if left[outcome.sequence] == 0:
+                finish(job, outcome.sequence, fleet[spacecraft_of[outcome.sequence]])
+            report(Progress(total, done, failures, time.monotonic() - started))
+        interruption.raise_if_requested()
+    return failures
 
 
 def _chunks(plans: list[SequencePlan]) -> Iterator[SequencePlan]:
     for plan in plans:
         for start in range(0, len(plan.indices), CHUNK):
-            yield dataclasses.replace(plan, indices=plan.indices[start : start + CHUNK])
-
-
-def _outcomes(root: Path, options: Options, plans: list[SequencePlan], workers: int, variant: str) -> Iterator[Outcome]:
-    """The outcome of each chunk as it comes."""
-    if workers < 1:
-        raise GknetError(f"workers: expected 1 or more, got {workers}")
-    chunks = _chunks(plans)
-    if workers == 1:
-        state = WorkerState(root, options, variant)
-        yield from (render_chunk(state, chunk) for chunk in chunks)
-        return
-    executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=start_worker, initargs=(root, options, variant)
-    )
-    running: set[Future[Outcome]] = set()
-    try:
-        for chunk in chunks:
-            running.add(executor.submit(worker_chunk, chunk))
-            if len(running) >= 2 * workers:
-                finished, running = wait(running, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in finished)
-        while running:
-            finished, running = wait(running, return_when=FIRST_COMPLETED)
-            yield from (future.result() for future in finished)
-    except BrokenProcessPool as error:
-        raise GknetError(
-            "a rendering process died (out of memory, or Mitsuba aborted); run the same command again to go on, "
-            "with --workers 1 or GKNET_MITSUBA_VARIANT=scalar_rgb if it happens again; a script of your own needs "
-            "if __name__ == '__main__' about its call"
-        ) from error
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+            yield replace(plan, indices=plan.indices[start : start + CHUNK])

@@ -1,22 +1,22 @@
-"""What a rendering job consists of: its options, its frames, and the window of each frame."""
+"""What a rendering job consists of: its recipe and options, its frames, and the window of each frame."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from gknet.dataset.skd_format import sequence_name
 from gknet.errors import GknetError
 from gknet.frame import Box
 from gknet.inference.crop import Crop
-from gknet.render.scenario import Recipe, Shot
+from gknet.render.options import Options, Selection
+from gknet.render.recipe import Recipe
+from gknet.render.scenario import Shot
 
-WINDOWS = ("frame", "target")
-DEFAULT_SIZE = {"frame": 1024, "target": 320}
 FILM_SIZES = (96, 128, 192, 256, 320)
 """Sizes of target windows: a renderer needs about a second for each new film size, so there are few of them."""
 TARGET_MARGIN = (1.35, 1.75)
@@ -26,74 +26,41 @@ TARGET_SHIFT = 0.08
 
 
 @dataclass(frozen=True)
-class Options:
-    """What makes one rendered folder differ from another.
+class Job:
+    """A folder and what is rendered into it.
 
-    window  'frame' renders the whole sensor, 'target' a square around the spacecraft
-    size    pixels of the picture's side; for target windows the largest
-    spp     samples per pixel
-    mask    whether masks are written
-    depth   whether depth maps are written
+    Attributes:
+        root: The dataset's folder.
+        recipe: The ranges that sequences are drawn from.
+        options: How frames are rendered.
     """
 
+    root: Path
     recipe: Recipe
-    seed: int
-    window: str
-    size: int
-    spp: int
-    mask: bool
-    depth: bool
+    options: Options
 
-    def __post_init__(self) -> None:
-        if self.window not in WINDOWS:
-            raise GknetError(f"window: expected one of {', '.join(WINDOWS)}, got '{self.window}'")
-        if not 16 <= self.size <= 8192:
-            raise GknetError(f"size: expected 16 to 8192 pixels, got {self.size}")
-        if self.spp < 1:
-            raise GknetError(f"spp: expected 1 or more samples per pixel, got {self.spp}")
-        if self.seed < 0:
-            raise GknetError(f"seed: expected 0 or more, got {self.seed}")
+    def folder(self, sequence: int) -> Path:
+        """The folder of a sequence, such as data/000001."""
+        return self.root / sequence_name(sequence)
+
+    def spacecraft_path(self, name: str) -> Path:
+        """A spacecraft's .toml; its .glb is beside it."""
+        return self.root / "spacecraft" / f"{name}.toml"
 
     def recorded(self) -> dict[str, object]:
         """As it is written beside the data, in JSON's types."""
-        plain: dict[str, object] = {field.name: getattr(self, field.name) for field in fields(self)}
-        return plain | {"recipe": self.recipe.model_dump(mode="json")}
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which of the recipe's frames to render. None takes all.
-
-    sequences  at most so many sequences of each spacecraft
-    every      frames first, first + every, ... of each sequence
-    frames     at most so many frames of each sequence
-    shard      (i, n): every n-th of the selected sequences, from the i-th
-    """
-
-    spacecraft: tuple[str, ...] | None = None
-    split: str | None = None
-    sequences: int | None = None
-    every: int = 1
-    first: int = 0
-    frames: int | None = None
-    shard: tuple[int, int] = (0, 1)
-
-    def __post_init__(self) -> None:
-        if self.split not in (None, "train", "val", "test"):
-            raise GknetError(f"split: expected train, val or test, got '{self.split}'")
-        for name, value in (("every", self.every), ("frames", self.frames), ("sequences", self.sequences)):
-            if value is not None and value < 1:
-                raise GknetError(f"{name}: expected 1 or more, got {value}")
-        if self.first < 0:
-            raise GknetError(f"first: expected 0 or more, got {self.first}")
-        i, n = self.shard
-        if not 0 <= i < n:
-            raise GknetError(f"shard: expected i/n with 0 <= i < n, got {i}/{n}")
+        return {"recipe": self.recipe.model_dump(mode="json")} | self.options.recorded()
 
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """The frames of one sequence to render."""
+    """The frames of one sequence to render.
+
+    Attributes:
+        sequence: Its number in the recipe, from 0.
+        spacecraft: The spacecraft's name.
+        indices: The frames' numbers in the sequence, from 0.
+    """
 
     sequence: int
     spacecraft: str
@@ -101,18 +68,18 @@ class SequencePlan:
 
 
 def plan_sequences(recipe: Recipe, selection: Selection) -> list[SequencePlan]:
-    """The selected sequences in the recipe's order; an empty selection is an error."""
-    for name in selection.spacecraft or ():
-        if name not in recipe.spacecraft:
-            raise GknetError(f"spacecraft: expected some of {', '.join(recipe.spacecraft)}, got '{name}'")
-    indices = tuple(range(selection.first, recipe.frames, selection.every))[: selection.frames]
+    """The selected sequences in the recipe's order.
+
+    Raises:
+        GknetError: The recipe has no spacecraft of a name, or the selection has no frame.
+    """
+    chosen = {_name_in(recipe, name) for name in selection.spacecraft or recipe.spacecraft}
+    indices = tuple(range(selection.first, recipe.frames, selection.every)[: selection.frames])
     taken: dict[str, int] = {}
     plans = []
     for sequence in range(recipe.sequences):
         spacecraft = recipe.spacecraft_of(sequence)
-        if selection.spacecraft and spacecraft not in selection.spacecraft:
-            continue
-        if selection.split and recipe.split_of(sequence) != selection.split:
+        if spacecraft not in chosen or selection.split not in (None, recipe.split_of(sequence)):
             continue
         taken[spacecraft] = taken.get(spacecraft, 0) + 1
         if selection.sequences is None or taken[spacecraft] <= selection.sequences:
@@ -125,18 +92,40 @@ def plan_sequences(recipe: Recipe, selection: Selection) -> list[SequencePlan]:
     return plans[i::n]
 
 
+def _name_in(recipe: Recipe, name: str) -> str:
+    """The recipe's own spelling of a spacecraft's name; capitals make no difference."""
+    if name in recipe.spacecraft:
+        return name
+    alike = [known for known in recipe.spacecraft if known.lower() == name.lower()]
+    if not alike:
+        raise GknetError(f"spacecraft: expected some of {', '.join(recipe.spacecraft)}, got '{name[:80]}'")
+    return alike[0]
+
+
 def window_of(options: Options, shot: Shot, points_m: Float[ndarray, "n 3"]) -> Crop:
-    """The square of the sensor to render for a shot."""
-    whole = Crop(0, 0, max(shot.camera.width, shot.camera.height), options.size)
+    """The square of the sensor to render for a shot.
+
+    Args:
+        options: Their window and size decide.
+        shot: The frame.
+        points_m: (n, 3) keypoints in the body frame.
+    """
+    whole = Crop(0, 0, max(shot.camera.width, shot.camera.height), options.side_px)
     if options.window == "frame":
         return whole
     pixels = shot.camera.project(shot.cam_from_body.transform(points_m))
     box = Box.around(pixels).clipped(shot.camera.width, shot.camera.height)
-    return whole if box is None else target_window(box, options.size, shot.seed)
+    return whole if box is None else target_window(box, options.side_px, shot.seed)
 
 
 def target_window(box: Box, size: int, seed: int) -> Crop:
-    """A jittered square around `box` at about native resolution, at most `size` pixels; the same for the same seed."""
+    """A jittered square around a box at about native resolution; the same for the same seed.
+
+    Args:
+        box: Of the keypoints, in pixels of the full image.
+        size: The picture has at most so many pixels a side.
+        seed: Of the jitter.
+    """
     random = np.random.default_rng([seed, 0x7A6])
     side = max(8, round(box.side * random.uniform(*TARGET_MARGIN)))
     shift_x, shift_y = random.uniform(-TARGET_SHIFT, TARGET_SHIFT, 2) * side
@@ -148,23 +137,3 @@ def target_window(box: Box, size: int, seed: int) -> Crop:
 def film_size(side: int, largest: int) -> int:
     """The smallest of the film sizes that holds a window of `side` native pixels, `largest` when none does."""
     return next((s for s in FILM_SIZES if min(side, largest) <= s <= largest), largest)
-
-
-def parse_names(spacecraft: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Spacecraft names from one name, a comma-separated list or a sequence."""
-    if spacecraft is None:
-        return None
-    names = spacecraft.split(",") if isinstance(spacecraft, str) else spacecraft
-    return tuple(name.strip().lower() for name in names if name.strip()) or None
-
-
-def parse_shard(text: str) -> tuple[int, int]:
-    """'0/4' -> (0, 4): the first of four parts."""
-    parts = text.split("/")
-    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
-        raise GknetError(f"shard: expected i/n such as 0/4, got '{text}'")
-    return int(parts[0]), int(parts[1])
-
-
-def spacecraft_path(root: Path, name: str) -> Path:
-    return root / "spacecraft" / f"{name}.toml"

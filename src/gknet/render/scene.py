@@ -17,9 +17,10 @@ from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.render import film
-from gknet.render.materials import build_shapes, read_glb
+from gknet.render.bsdf import build_shapes
+from gknet.render.mesh import load_mesh
 from gknet.render.scenario import EARTH_RADIUS_M, Shot
-from gknet.render.shading import Light, Region, Shader
+from gknet.render.shading import IncidentLight, Region, Shader
 from gknet.render.variant import Engine, choose_variant, load_engine
 from gknet.spacecraft import Spacecraft
 
@@ -31,11 +32,12 @@ OCCLUSION_TOLERANCE = 0.002
 class Rendered:
     """The spacecraft alone in a square window of `s` pixels.
 
-    radiance  linear RGB, premultiplied by alpha (black where there is no spacecraft)
-    alpha     part of the pixel that the spacecraft covers
-    mask      the ray of the pixel's centre meets the spacecraft
-    depth_m   z of that point in the camera frame, 0 outside the mask
-    visible   per keypoint: in front, inside the full image, nothing before it
+    Attributes:
+        radiance: (s, s, 3) linear RGB, premultiplied by alpha: black where there is no spacecraft.
+        alpha: (s, s) the part of the pixel that the spacecraft covers, 0 to 1.
+        mask: (s, s) whether the ray of the pixel's centre meets the spacecraft.
+        depth_m: (s, s) z of that point in the camera frame in m, 0 outside of the mask.
+        visible: (n,) whether a keypoint is in front of the camera, inside the full image, and not hidden.
     """
 
     radiance: Float32[ndarray, "s s 3"]
@@ -48,10 +50,14 @@ class Rendered:
 class Renderer:
     """One spacecraft, loaded once, rendered from any pose.
 
-    variant   of Mitsuba, None for `choose_variant()`: llvm_ad_rgb, scalar_rgb, or cuda_ad_rgb (by its looks the same
-              as LLVM, but never tried)
-    spp       samples a pixel
-    threads   of this process, None for all cores
+    Args:
+        spacecraft: Its mesh is in the body frame, in metres.
+        variant: Mitsuba's, None for `choose_variant()`: llvm_ad_rgb, scalar_rgb, or cuda_ad_rgb (never tried).
+        spp: Samples per pixel.
+        threads: Threads of this process, None for all cores.
+
+    Raises:
+        GknetError: There is no mesh, it cannot be read or its scale is not the spacecraft's, or the variant cannot run.
     """
 
     def __init__(
@@ -59,22 +65,28 @@ class Renderer:
     ) -> None:
         if spp < 1 or (threads is not None and threads < 1):
             raise GknetError(f"renderer: expected a positive spp and number of threads, got {spp} and {threads}")
-        if spacecraft.mesh_path is None:
-            raise GknetError(f"{spacecraft.name}: it has no mesh to render; build one with `gknet fleet FOLDER`")
-        surfaces = read_glb(spacecraft.mesh_path)
+        parts = load_mesh(spacecraft)
         self.spacecraft = spacecraft
         self.variant = variant or choose_variant()
         self.spp = spp
         engine = load_engine(self.variant)
         if threads is not None:
             engine.dr.set_thread_count(threads)
-        self._hull_m = _hull(np.concatenate([surface.vertices_m for surface in surfaces]))
-        self._shapes = build_shapes(engine.mi, surfaces)
+        self._hull_m = _hull(np.concatenate([part.vertices_m for part in parts]))
+        self._shapes = build_shapes(engine.mi, parts)
         self._scene = engine.mi.load_dict({"type": "scene", **self._shapes})
         self._shader = None if engine.scalar else Shader(engine, self._scene, spp)
 
     def render(self, shot: Shot, window: Crop) -> Rendered:
-        """The spacecraft in `window` of the shot's camera; the same shot gives the same bits."""
+        """The spacecraft in a part of a shot's picture; the same shot gives the same bits.
+
+        Args:
+            shot: Poses are cam_from_body in the OpenCV camera frame, lengths in m.
+            window: A square of the shot's full image, in its pixels; the picture has `window.size` pixels a side.
+
+        Raises:
+            GknetError: The camera has skew or pixels that are not square, or the spacecraft is inside the Earth.
+        """
         engine = load_engine(self.variant)
         camera = shot.camera.warped(window.input_from_image, window.size, window.size)
         _check_square(camera)
@@ -110,18 +122,18 @@ class Renderer:
         return self._shader.unhidden(body_from_cam, points_cam, tolerance_m)
 
 
-def light_of(shot: Shot) -> Light:
+def light_of(shot: Shot) -> IncidentLight:
     """The sun, the Earth and a faint sky as the spacecraft of a shot meets them, in its body frame."""
     rotation = shot.cam_from_body.rotation
     sun = np.asarray(shot.sun_direction, dtype=np.float64)
     centre = None
     earth = shot.planet or shot.earth
     if earth is not None:
-        # It looks the same from all parts of the spacecraft.
+        # The Earth is so far that one centre serves all parts of the spacecraft.
         centre = (earth.centre_cam_m - shot.cam_from_body.translation_m) @ rotation / EARTH_RADIUS_M
         if centre @ centre <= 1:
             raise GknetError(f"shot: the spacecraft is inside the Earth ({np.linalg.norm(centre):.4f} radii away)")
-    return Light(sun / np.linalg.norm(sun) @ rotation, centre)
+    return IncidentLight(sun / np.linalg.norm(sun) @ rotation, centre)
 
 
 def region_of(camera: Camera, hull_cam_m: Float[ndarray, "v 3"]) -> Region | None:

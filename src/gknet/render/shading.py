@@ -31,7 +31,7 @@ STARLIGHT = 0.002
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class IncidentLight:
     """Light in the body frame. Radiance 1.0 is a white Lambertian surface that faces the full sun.
 
     sun            unit vector to the sun, whose irradiance is pi
@@ -77,7 +77,7 @@ class Shader:
         self._radiance, self._depth = engine.dr.freeze(radiance), engine.dr.freeze(depth)
 
     def radiance(
-        self, camera: Camera, body_from_cam: Pose, region: Region, light: Light, seed: int
+        self, camera: Camera, body_from_cam: Pose, region: Region, light: IncidentLight, seed: int
     ) -> Float32[ndarray, "h w 4"]:
         """Premultiplied linear RGB and alpha of a region, averaged over each pixel (a box filter)."""
         rows = max(1, SAMPLES_AT_ONCE // (region.width * self._spp))
@@ -85,7 +85,7 @@ class Shader:
         return np.concatenate(bands)
 
     def _band(
-        self, camera: Camera, body_from_cam: Pose, region: Region, light: Light, seed: int
+        self, camera: Camera, body_from_cam: Pose, region: Region, light: IncidentLight, seed: int
     ) -> Float32[ndarray, "h w 4"]:
         dr = self._engine.dr
         index = self._indices(region.width * region.height * self._spp)
@@ -134,7 +134,7 @@ def _view(camera: Camera, body_from_cam: Pose) -> Float[ndarray, "16"]:
     return np.concatenate([body_from_cam.rotation.T.ravel(), body_from_cam.translation_m, inverse_focal, offset])
 
 
-def _light(light: Light) -> Float[ndarray, "7"]:
+def _light(light: IncidentLight) -> Float[ndarray, "7"]:
     """The sun's direction, the Earth's centre and its power |c|^2 - 1, infinite without an Earth."""
     if light.earth_centre is None:
         return np.array([*light.sun, 2, 0, 0, np.inf])
@@ -220,7 +220,7 @@ def _sky(engine: Engine, light: list[Any], direction: Any) -> Any:
     return mi.Color3f(*EARTH_ALBEDO) * lambert + STARLIGHT
 
 
-def sky_radiance(light: Light, directions: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+def sky_radiance(light: IncidentLight, directions: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
     """Radiance that comes from each direction of the body frame: what the kernel sees as Earth and sky."""
     radiance = np.full((len(directions), 3), STARLIGHT)
     if light.earth_centre is not None:

@@ -20,7 +20,7 @@ GRAVITY_M3_S2 = 3.986004418e14
 """The Earth's gravitational parameter."""
 
 Times = Float[ndarray, " t"]
-Path = Float[ndarray, "t 3"]
+Positions = Float[ndarray, "t 3"]
 
 
 def mean_motion(orbit_radius_m: float) -> float:
@@ -43,7 +43,7 @@ def relative_transition(rate: float, time_s: Times) -> Float[ndarray, "t 6 6"]:
     return phi
 
 
-def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Float[ndarray, "3"]) -> Path:
+def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Float[ndarray, "3"]) -> Positions:
     """The free flight from `start_m` at the first time to `end_m` at the last."""
     elapsed = time_s - time_s[0]
     if not 0 < rate * elapsed[-1] < np.pi:
@@ -55,7 +55,9 @@ def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Fl
     return phi[:, :3] @ np.concatenate([start_m, velocity])
 
 
-def fly_around(rate: float, time_s: Times, radial_m: float, normal_m: float, angles_rad: tuple[float, float]) -> Path:
+def fly_around(
+    rate: float, time_s: Times, radial_m: float, normal_m: float, angles_rad: tuple[float, float]
+) -> Positions:
     """The closed relative ellipse: `radial_m` by twice that along the track, tilted by `normal_m` across it.
 
     `angles_rad` are the phases in the orbital plane and across it at time 0. Without y' = -2 n x the ellipse drifts.
@@ -64,7 +66,7 @@ def fly_around(rate: float, time_s: Times, radial_m: float, normal_m: float, ang
     return np.stack([radial_m * np.cos(in_plane), -2 * radial_m * np.sin(in_plane), normal_m * np.cos(across)], axis=1)
 
 
-def hold(time_s: Times, point_m: Float[ndarray, "3"], slack: float, rng: np.random.Generator) -> Path:
+def hold(time_s: Times, point_m: Float[ndarray, "3"], slack: float, rng: np.random.Generator) -> Positions:
     """Station-keeping: a point of LVLH held by thrust within the fraction `slack` of its distance.
 
     Only points on the track (x = z = 0) are equilibria; the others cost propellant, and inspectors pay it.
@@ -83,7 +85,7 @@ def band_limited(time_s: Times, rng: np.random.Generator, periods_s: tuple[float
 
 def tumble(
     inertia: Float[ndarray, "3"], attitude_wxyz: Float[ndarray, "4"], spin_rad_s: Float[ndarray, "3"], time_s: Times
-) -> tuple[Float[ndarray, "t 4"], Path]:
+) -> tuple[Float[ndarray, "t 4"], Positions]:
     """Torque-free rotation: quaternions wxyz (inertial from body) and body rates at each time, from those at 0.
 
     `inertia` are the principal moments, along the body's axes here; only their ratios matter.
@@ -138,7 +140,7 @@ def random_direction(rng: np.random.Generator) -> Float[ndarray, "3"]:
     return vector / np.linalg.norm(vector)
 
 
-def look_at(target: Path, up: Float[ndarray, "3"]) -> Float[ndarray, "t 3 3"]:
+def look_at(target: Positions, up: Float[ndarray, "3"]) -> Float[ndarray, "t 3 3"]:
     """Rotations cam_from_frame of cameras that look along `target` (t, 3); image up is the side of `up`."""
     z = target / np.linalg.norm(target, axis=1, keepdims=True)
     x = np.cross(z, up)

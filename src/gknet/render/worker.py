@@ -1,15 +1,12 @@
-"""Rendering single frames: what each worker process of `generate` does."""
+"""Rendering single frames: what each process of a rendering job does."""
 
 from __future__ import annotations
 
 import errno
-import json
-import os
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from threading import Lock
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
@@ -20,19 +17,29 @@ from gknet.geometry import Camera
 from gknet.inference.crop import Crop
 from gknet.io.spacecraft_file import load_spacecraft
 from gknet.render.background import background
-from gknet.render.plan import Options, SequencePlan, spacecraft_path, window_of
+from gknet.render.folder import folder_lock
+from gknet.render.journal import JOURNAL, append_row
+from gknet.render.plan import Job, SequencePlan, window_of
 from gknet.render.scenario import Shot, shoot
 from gknet.render.scene import Renderer
 from gknet.render.sensor import expose
 from gknet.spacecraft import Spacecraft
 
-JOURNAL = "journal.jsonl"
-"""Label rows of a sequence under way, one JSON line a frame; annotations.csv takes its place at the end."""
+FATAL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+"""Errors of the disk that no other frame will escape."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """A finished frame: what is written to disk."""
+    """A finished frame: what is written to disk.
+
+    Attributes:
+        rgb: (s, s, 3) uint8.
+        mask: (s, s) whether the ray of the pixel's centre meets the spacecraft.
+        depth_m: (s, s) z of that point in the camera frame in m, 0 outside of the mask.
+        visible: (n,) whether each keypoint is in the full image and not hidden.
+        camera: Of this picture, which may be a part of the full image.
+    """
 
     rgb: UInt8[ndarray, "s s 3"]
     mask: Bool[ndarray, "s s"]
@@ -43,7 +50,13 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a chunk of frames went: `failures` are the reasons, one for each frame that has no picture."""
+    """What became of a chunk of frames.
+
+    Attributes:
+        sequence: Of the chunk.
+        done: The number of frames that are on disk now.
+        failures: Reasons, one for each frame that has no picture.
+    """
 
     sequence: int
     done: int
@@ -52,21 +65,27 @@ class Outcome:
 
 @dataclass
 class WorkerState:
-    """The renderers of a process, one for each spacecraft, made when first needed.
+    """What a rendering process keeps from frame to frame.
 
-    threads   of this process, None for all cores
+    Attributes:
+        job: The folder and its options.
+        variant: Mitsuba's.
+        threads: Of this process, None for all cores.
+        renderers: One for each spacecraft, made when first needed.
+        writing: Held while files are written.
     """
 
-    out: Path
-    options: Options
+    job: Job
     variant: str
     threads: int | None = None
     renderers: dict[str, tuple[Spacecraft, Renderer]] = field(default_factory=dict)
+    writing: Lock = field(default_factory=Lock)
 
     def renderer(self, name: str) -> tuple[Spacecraft, Renderer]:
+        """A spacecraft of the folder, and its renderer."""
         if name not in self.renderers:
-            spacecraft = load_spacecraft(spacecraft_path(self.out, name))
-            self.renderers[name] = spacecraft, Renderer(spacecraft, self.variant, self.options.spp, self.threads)
+            spacecraft = load_spacecraft(self.job.spacecraft_path(name))
+            self.renderers[name] = spacecraft, Renderer(spacecraft, self.variant, self.job.options.spp, self.threads)
         return self.renderers[name]
 
 
@@ -99,21 +118,13 @@ def _on_sensor(window: Crop, camera: Camera) -> Bool[ndarray, "s s"]:
     return ((y >= 0) & (y <= camera.height))[:, None] & ((x >= 0) & (x <= camera.width))[None]
 
 
-def render_frame(state: WorkerState, name: str, sequence: int, index: int) -> dict[str, str]:
-    """Render one frame and write its files; its label row."""
-    options = state.options
+def render_frame(state: WorkerState, name: str, sequence: int, index: int) -> None:
+    """Render one frame, write its files, and then its label row into the sequence's journal."""
+    job, options = state.job, state.job.options
     spacecraft, renderer = state.renderer(name)
-    shot = shoot(options.recipe, spacecraft, options.seed, sequence, index)
+    shot = shoot(job.recipe, spacecraft, options.seed, sequence, index)
     picture = render_shot(renderer, spacecraft, shot, window_of(options, shot, spacecraft.points_m))
-    write_frame_files(
-        state.out / sequence_name(sequence),
-        index,
-        picture.rgb,
-        shot.sensor.jpeg_quality,
-        picture.mask if options.mask else None,
-        picture.depth_m if options.depth else None,
-    )
-    return row_of(
+    row = row_of(
         Annotation(
             category=category_of(name),
             index=index,
@@ -123,67 +134,47 @@ def render_frame(state: WorkerState, name: str, sequence: int, index: int) -> di
             sun_direction=shot.sun_direction,
             earth=shot.earth is not None,
             camera=picture.camera,
-            recipe=options.recipe.name,
+            recipe=job.recipe.name,
             seed=options.seed,
         )
     )
+    with state.writing:
+        write_frame_files(
+            job.folder(sequence),
+            index,
+            picture.rgb,
+            shot.sensor.jpeg_quality,
+            picture.mask if options.has_masks else None,
+            picture.depth_m if options.depth else None,
+        )
+        with folder_lock(job.root):
+            append_row(job.folder(sequence) / JOURNAL, row)
 
 
-def render_chunk(state: WorkerState, plan: SequencePlan) -> Outcome:
-    """Render the frames of a plan; a frame that fails is reported and the others go on, a full disk ends it all."""
-    journal = state.out / sequence_name(plan.sequence) / JOURNAL
-    failures = []
+def render_chunk(state: WorkerState, plan: SequencePlan, is_stopped: Callable[[], bool]) -> Outcome:
+    """Render the frames of a plan; a frame that fails is reported and the others go on, a full disk ends it all.
+
+    Args:
+        state: Of this process.
+        plan: The frames.
+        is_stopped: Asked before each frame; once it is true, the rest is left out.
+    """
+    done, failures = 0, []
     for index in plan.indices:
+        if is_stopped():
+            break
         try:
-            append_row(journal, render_frame(state, plan.spacecraft, plan.sequence, index))
+            render_frame(state, plan.spacecraft, plan.sequence, index)
+            done += 1
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+            if error.errno in FATAL_ERRNOS:
                 raise
             failures.append(_reason(plan.sequence, index, error))
         except Exception as error:
             failures.append(_reason(plan.sequence, index, error))
-    return Outcome(plan.sequence, len(plan.indices) - len(failures), tuple(failures))
+    return Outcome(plan.sequence, done, tuple(failures))
 
 
 def _reason(sequence: int, index: int, error: Exception) -> str:
     text = str(error).strip().splitlines() or [""]
     return f"{sequence_name(sequence)} frame {index}: {type(error).__name__}: {text[0]}"
-
-
-def append_row(journal: Path, row: dict[str, str]) -> None:
-    """Append a row in one write. A line starts with its newline, so that one cut off by a kill spoils no other."""
-    line = "\n" + json.dumps(row)
-    handle = os.open(journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(handle, line.encode("utf-8"))
-    finally:
-        os.close(handle)
-
-
-def read_journal(journal: Path) -> Iterable[dict[str, str]]:
-    """The whole rows of a journal; a line cut off by a kill is left out, its frame is rendered again."""
-    if not journal.exists():
-        return
-    for line in journal.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(row, dict) and str(row.get("frame", "")).isdecimal():
-            yield row
-
-
-_state: WorkerState | None = None
-
-
-def start_worker(out: Path, options: Options, variant: str) -> None:
-    """Called once in each worker process: one thread each, and a state of its own."""
-    global _state
-    cv2.setNumThreads(1)
-    _state = WorkerState(out, options, variant, threads=1)
-
-
-def worker_chunk(plan: SequencePlan) -> Outcome:
-    if _state is None:
-        raise RuntimeError("start_worker was not called in this process")
-    return render_chunk(_state, plan)
