@@ -37,7 +37,7 @@ suppress_warnings = ["myst.header"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
-autodoc_default_options = {"members": True}
+default_role = "code"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 napoleon_numpy_docstring = False
@@ -50,6 +50,7 @@ html_static_path = ["_static"]
 html_css_files = ["gknet.css"]
 html_show_sourcelink = False
 html_copy_source = False
+html_show_copyright = False
 html_math_renderer = "mathml"
 html_theme_options = {"source_repository": "", "navigation_with_keys": True}
 

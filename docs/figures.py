@@ -53,6 +53,10 @@ def note(axes: Axes, x: float, y: float, text: str, **style: object) -> None:
     axes.text(x, y, text, **({"ha": "center", "va": "center", "fontsize": 9, "color": INK} | style))
 
 
+def label(axes: Axes, place: np.ndarray | tuple[float, float], text: str, **style: object) -> None:
+    note(axes, float(place[0]), float(place[1]), text, **style)
+
+
 FROM_BEHIND = np.array([[1.0, 0.0], [0.0, -1.0], [0.55, 0.38]])
 """Camera axes on paper: x to the right, y down, z into the paper's upper right."""
 
@@ -78,7 +82,7 @@ def triad(
         direction = view(rotation[:, k][None], on_paper)[0]
         arrow(axes, tuple(place), tuple(place + direction * length), AXIS_COLOURS[k], linewidth=1.8)
         away = place + direction * (length + 0.17 / np.linalg.norm(direction))
-        note(axes, *away, names[k], color=AXIS_COLOURS[k], fontsize=11)
+        label(axes, away, names[k], color=AXIS_COLOURS[k], fontsize=11)
 
 
 def cuboid(axes: Axes, pose: Pose, half: np.ndarray, origin: np.ndarray, scale: float) -> None:
@@ -139,14 +143,14 @@ def camera() -> Figure:
     centre, seen = on_paper(0, 0, depth), np.array([-0.35, -0.3, depth])
     point = seen * 2.3
     axes.plot(*centre, "+", color=INK, ms=9)
-    note(axes, *(centre + (0.05, -0.17)), "$(c_x, c_y)$", fontsize=10)
+    label(axes, (centre + (0.05, -0.17)), "$(c_x, c_y)$", fontsize=10)
     axes.plot(*np.array([eye, on_paper(*point)]).T, color=GREEN, lw=1.2)
     axes.plot(*on_paper(*point), "o", color=GREEN, ms=6)
     axes.plot(*on_paper(*seen), "o", color=ORANGE, ms=6)
-    note(axes, *(on_paper(*point) + (0.45, -0.02)), "$(x, y, z)$", color=GREEN, fontsize=11)
-    note(axes, *(on_paper(*seen) + (-0.02, 0.2)), "$(u, v)$", color=ORANGE, fontsize=11)
-    note(axes, *(on_paper(*corners[0], depth) + (0.3, 0.02)), "(0, 0)", fontsize=8.5)
-    note(axes, *(on_paper(*corners[2], depth) + (-0.38, 0.0)), "$(W, H)$", fontsize=8.5)
+    label(axes, (on_paper(*point) + (0.45, -0.02)), "$(x, y, z)$", color=GREEN, fontsize=11)
+    label(axes, (on_paper(*seen) + (-0.02, 0.2)), "$(u, v)$", color=ORANGE, fontsize=11)
+    label(axes, (on_paper(*corners[0], depth) + (0.3, 0.02)), "(0, 0)", fontsize=8.5)
+    label(axes, (on_paper(*corners[2], depth) + (-0.38, 0.0)), "$(W, H)$", fontsize=8.5)
     note(axes, 4.9, 1.15, r"$u = f_x\, x / z + c_x$", fontsize=13, ha="left")
     note(axes, 4.9, 0.75, r"$v = f_y\, y / z + c_y$", fontsize=13, ha="left")
     note(axes, 3.6, 0.18, "The camera's z axis meets the image at $(c_x, c_y)$.")
@@ -206,11 +210,11 @@ def crop() -> Figure:
     square(box.x0, box.y0, box.x1 - box.x0, box.y1 - box.y0, fc=PALE_ORANGE, ec=ORANGE, lw=1, ls="--")
     square(made.x0, made.y0, made.side, made.side, fc="none", ec=BLUE, lw=2)
     axes.plot(*on_paper(300, 140), "o", color=GREEN, ms=5)
-    note(axes, *on_paper(0, -18), "(0, 0)", fontsize=8.5)
-    note(axes, *on_paper(made.x0 - 4, made.y0 - 16), "$(x_0, y_0)$", color=BLUE, fontsize=10)
-    note(axes, *on_paper(made.x0 + made.side / 2, made.y0 + made.side + 16), "side", color=BLUE)
-    note(axes, *on_paper(110, 150), "image", fontsize=10)
-    note(axes, *on_paper(200, 330), "outside of the image the crop is black", fontsize=8.5)
+    label(axes, on_paper(0, -18), "(0, 0)", fontsize=8.5)
+    label(axes, on_paper(made.x0 - 4, made.y0 - 16), "$(x_0, y_0)$", color=BLUE, fontsize=10)
+    label(axes, on_paper(made.x0 + made.side / 2, made.y0 + made.side + 16), "side", color=BLUE)
+    label(axes, on_paper(110, 150), "image", fontsize=10)
+    label(axes, on_paper(200, 330), "outside of the image the crop is black", fontsize=8.5)
     side, x1, y1 = 2.0, 4.75, 0.75
     scale = side / made.side
     axes.add_patch(Rectangle((x1, y1), side, side, fc="#404040", ec=BLUE, lw=2))
@@ -290,9 +294,9 @@ def rotation() -> Figure:
             tip = left + view(turned.as_matrix()[:, k][None])[0] * 0.95
             arrow(axes, tuple(left), tuple(tip), AXIS_COLOURS[k], linestyle=style, linewidth=1.7)
     for k, name in enumerate("xyz"):
-        note(
+        label(
             axes,
-            *(left + view(first.as_matrix()[:, k][None])[0] * 1.12),
+            (left + view(first.as_matrix()[:, k][None])[0] * 1.12),
             f"${name}$",
             color=AXIS_COLOURS[k],
             fontsize=10,
@@ -300,14 +304,14 @@ def rotation() -> Figure:
     note(axes, 1.7, 0.15, r"two attitudes:  $\theta = 2 \arccos |\langle q_1, q_2 \rangle|$", fontsize=11)
     centre, radius = np.array([5.3, 1.35]), 0.75
     arrow(axes, tuple(centre - (0.25, 0.85)), tuple(centre + (0.36, 1.22)), INK, linewidth=1.6)
-    note(axes, *(centre + (0.52, 1.25)), "$n$", fontsize=12)
+    label(axes, (centre + (0.52, 1.25)), "$n$", fontsize=12)
     angles = np.radians(np.linspace(200, 480, 80))
     ring = centre + np.column_stack(
         [radius * np.cos(angles), 0.3 * radius * np.sin(angles) - 0.22 * radius * np.cos(angles)]
     )
     axes.plot(*ring.T, color=BLUE, lw=1.6)
     arrow(axes, tuple(ring[-2]), tuple(ring[-1]), BLUE, mutation_scale=15)
-    note(axes, *(centre + (0.98, -0.12)), r"$\theta$", fontsize=13, color=BLUE)
+    label(axes, (centre + (0.98, -0.12)), r"$\theta$", fontsize=13, color=BLUE)
     note(axes, 5.3, 0.15, r"$q = (\cos \frac{\theta}{2},\ n \sin \frac{\theta}{2})$, and $-q$ is the same", fontsize=11)
     return figure
 
@@ -375,7 +379,7 @@ def errors() -> Figure:
         arrow(axes, tuple(centre), tuple(centre + 0.95 * np.array([np.cos(turn), np.sin(turn)])), colour, linewidth=1.8)
     arc = np.radians(np.linspace(35, 70, 20))
     axes.plot(*(centre[:, None] + 0.6 * np.array([np.cos(arc), np.sin(arc)])), color=ORANGE, lw=2)
-    note(axes, *(centre + 0.8 * np.array([np.cos(0.92), np.sin(0.92)])), "$E_q$", fontsize=11, color=ORANGE)
+    label(axes, (centre + 0.8 * np.array([np.cos(0.92), np.sin(0.92)])), "$E_q$", fontsize=11, color=ORANGE)
     note(axes, centre[0] + 0.42, centre[1] + 1.05, "$q$", fontsize=12)
     note(axes, centre[0] + 0.95, centre[1] + 0.6, r"$\hat q$", fontsize=12, color=BLUE)
     note(axes, 4.1, 0.45, r"$E_q = 2 \arccos |\langle q, \hat q \rangle|$", fontsize=11)
@@ -411,9 +415,9 @@ def block(
         lw=0.9,
     )
     axes.add_patch(shape)
-    note(axes, x, y + (0.09 * (1 + under.count("\n")) if under else 0), title, fontsize=8.6, fontweight="bold")
+    note(axes, x, y + (0.09 * (1 + under.count("\n")) if under else 0), title, fontsize=9.4, fontweight="bold")
     if under:
-        note(axes, x, y - 0.1, under, fontsize=7.4)
+        note(axes, x, y - 0.1, under, fontsize=8.3)
 
 
 def pipeline() -> Figure:
@@ -500,24 +504,24 @@ def architecture() -> Figure:
     arrow(axes, (4.5, 3.85), (4.55, 3.32))
     axes.plot([7.6, 7.6, 1.6], [3.86, 3.66, 3.66], color=GREEN, lw=1.3)
     arrow(axes, (1.6, 3.66), (1.6, 3.31), GREEN)
-    note(axes, 6.1, 3.76, "added to the maps", color=GREEN, fontsize=7.6)
+    note(axes, 6.1, 3.76, "added to the maps", color=GREEN, fontsize=8.4)
     arrow(axes, (2.38, row3), (3.32, row3))
-    note(axes, 2.72, row3 + 0.13, "where", fontsize=7.6)
+    note(axes, 2.72, row3 + 0.13, "where", fontsize=8.4)
     arrow(axes, (5.88, row3), (6.32, row3))
     axes.plot([7.87, 9.1, 9.1], [row3, row3, row1], color=ORANGE, lw=1.3)
     arrow(axes, (9.1, row1), (8.68, row1), ORANGE)
-    note(axes, 9.2, 3.9, "the first maps\n(pixel + node)\nupdate the\nattitude", color=ORANGE, fontsize=7.6, ha="left")
+    note(axes, 9.2, 3.9, "the first maps\n(pixel + node)\nupdate the\nattitude", color=ORANGE, fontsize=8.4, ha="left")
     arrow(axes, (4.6, 2.49), (4.6, 1.66), INK)
     note(
         axes,
         4.72,
         2.12,
         "sharpened probability of the first maps\n(in training: some keypoints teacher-forced)",
-        fontsize=7.6,
+        fontsize=8.4,
         ha="left",
     )
     arrow(axes, (1.3, 2.5), (1.3, 1.66))
-    note(axes, 1.4, 2.08, "prior of the\nupdated attitude", fontsize=7.6, ha="left", color=GREEN)
+    note(axes, 1.4, 2.08, "prior of the\nupdated attitude", fontsize=8.4, ha="left", color=GREEN)
     arrow(axes, (5.88, second), (6.32, second))
     arrow(axes, (1.3, 0.83), (3.1, 0.35))
     arrow(axes, (7.1, 0.83), (6.1, 0.42))

@@ -36,8 +36,8 @@ def main() -> None:
         if found is None:
             errors.append((1.0, np.pi))
         else:
-            off_m = np.linalg.norm(found.translation_m - truth.translation_m)
-            errors.append((off_m / np.linalg.norm(truth.translation_m), found.angle_to(truth)))
+            off_m = float(np.linalg.norm(found.translation_m - truth.translation_m))
+            errors.append((off_m / float(np.linalg.norm(truth.translation_m)), found.angle_to(truth)))
         print(f"{frame.name}  E_t {errors[-1][0]:.4f}  E_q {errors[-1][1]:.4f} rad")
     e_t, e_q = np.median(errors, axis=0)
     print(f"median of {len(errors)} frames  E_t {e_t:.4f}  E_q {e_q:.4f} rad")

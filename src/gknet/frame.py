@@ -213,7 +213,7 @@ class FailureKind(StrEnum):
 
     @property
     def label(self) -> str:
-        """The word as it is shown to people: spaces instead of underscores."""
+        """The word as it is shown to people, with spaces instead of underscores."""
         return self.value.replace("_", " ")
 
 

@@ -1,4 +1,4 @@
-"""Laws of the graph decoder: constant edges, who hears of whom, what a node sees at a glance, how branches join."""
+"""Laws of the graph decoder: constant edges, paths between nodes, feature sampling, position votes, fusion."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_renumbering_the_keypoints_renumbers_nodes_and_nothing_else(kind: type[t
 
 
 def test_renumbering_the_keypoints_of_a_network_renumbers_its_channels() -> None:
-    """Channel k, node k and row k of the adjacency are one keypoint: whoever moves one of them moves them all."""
+    """Channel k, node k and row k of the adjacency are one keypoint."""
     order = np.array([3, 0, 4, 1, 2])
     network = tiny(5).eval()
     other = GKNet(network.config, chain(5)[np.ix_(order, order)], points(5)[order]).eval()
@@ -81,19 +81,19 @@ def test_renumbering_the_keypoints_of_a_network_renumbers_its_channels() -> None
     torch.testing.assert_close(other(image), network(image)[:, order], atol=1e-4, rtol=1e-4)
 
 
-def test_a_message_knows_both_of_its_ends() -> None:
-    """What node 0 tells node 1 depends on node 1: under eq. 2 it would tell all its neighbours the same."""
+def test_a_message_depends_on_both_of_its_ends() -> None:
+    """The message from node 0 to node 1 depends on node 1: under eq. 2 all neighbours would receive the same."""
     torch.manual_seed(4)
     layer = EdgeConvolution(normalised_adjacency(chain(3)), 8, 8)
     nodes = torch.randn(1, 3, 8)
-    silent = nodes.clone()
-    silent[0, 0] = torch.randn(8)
-    told = (layer(nodes) - layer(silent))[0]  # by a change of node 0
+    other = nodes.clone()
+    other[0, 0] = torch.randn(8)
+    received = (layer(nodes) - layer(other))[0]  # by a change of node 0
     nodes[0, 1] += 1
-    silent[0, 1] += 1
-    told_anew = (layer(nodes) - layer(silent))[0]
-    assert (told[1] - told_anew[1]).abs().max() > 1e-3
-    assert not told[2].any()
+    other[0, 1] += 1
+    received_anew = (layer(nodes) - layer(other))[0]
+    assert (received[1] - received_anew[1]).abs().max() > 1e-3
+    assert not received[2].any()
 
 
 def test_a_vote_goes_along_its_edge_and_no_other() -> None:
@@ -101,20 +101,20 @@ def test_a_vote_goes_along_its_edge_and_no_other() -> None:
     layer = EdgeConvolution(normalised_adjacency(chain(4)), 8, 8, votes=True)
     nodes, votes = torch.randn(1, 4, 8), torch.randn(1, 4, 4, POSITION_WIDTH)
     before = layer(nodes, votes)
-    for to, sender, heard in ((1, 0, True), (2, 3, True), (0, 3, False), (3, 1, False)):
+    for to, sender, reached in ((1, 0, True), (2, 3, True), (0, 3, False), (3, 1, False)):
         other = votes.clone()
         other[0, to, sender] += 1
         changed = (layer(nodes, other) - before).abs().amax(dim=(0, 2)) > 1e-6
-        assert changed.tolist() == [heard and k == to for k in range(4)]
+        assert changed.tolist() == [reached and k == to for k in range(4)]
 
 
-def test_votes_are_of_what_nodes_are_convinced_of_and_come_before_the_second_look_alone() -> None:
-    """A told keypoint puts its neighbour where the attitude says that it lies from there."""
+def test_position_votes_enter_the_second_pass_alone_and_start_from_prompted_positions() -> None:
+    """A prompted keypoint places its neighbour at the attitude's offset from there."""
     network = tiny(5).eval()
     assert network.decoder is not None
-    said: list[torch.Tensor | None] = []
+    votes: list[torch.Tensor | None] = []
     for layer in network.decoder.layers:
-        layer.graph.register_forward_hook(lambda module, given, out: said.append(given[1]))
+        layer.graph.register_forward_hook(lambda module, given, out: votes.append(given[1]))
     network.attitude.classes.weight.data.zero_()
     network.attitude.classes.bias.data = torch.full_like(network.attitude.classes.bias, -400)
     network.attitude.classes.bias.data[7] = 0
@@ -123,92 +123,93 @@ def test_votes_are_of_what_nodes_are_convinced_of_and_come_before_the_second_loo
     network.branches(
         torch.rand(1, 3, 64, 64), KeypointPrompts(truth, torch.tensor([[False, True, False, False, False]]))
     )
-    assert said[:2] == [None, None]
-    assert said[2] is said[3]
-    place = torch.tensor([9.5, 3.5]) / 16 + network.prior.keypoints[7, 2] - network.prior.keypoints[7, 1]
-    assert said[2] is not None
-    torch.testing.assert_close(said[2][0, 2, 1], fourier_encoding(place), atol=1e-4, rtol=1e-4)
+    assert votes[:2] == [None, None]
+    assert votes[2] is votes[3]
+    expected = network.prior.expected_keypoints[7]
+    position = torch.tensor([9.5, 3.5]) / 16 + expected[2] - expected[1]
+    assert votes[2] is not None
+    torch.testing.assert_close(votes[2][0, 2, 1], fourier_encoding(position), atol=1e-4, rtol=1e-4)
 
 
-def glances_at(pixels: torch.Tensor, prompts: KeypointPrompts | None = None) -> list[torch.Tensor]:
-    """Codes of the places (n, 34) that nodes see where the other branch has the maps `pixels`, at each glance."""
+def sampled(pixels: torch.Tensor, prompts: KeypointPrompts | None = None) -> list[torch.Tensor]:
+    """Encodings of the positions (n, 16) that nodes sample, layer by layer, where the other branch has given maps."""
     network = tiny(pixels.shape[1], bins=0).eval()
     assert network.decoder is not None
     network.pixel_head.register_forward_hook(lambda module, given, out: pixels)
     with torch.no_grad():
         network.node_filter.weight.zero_()
         network.node_filter.bias.zero_()
-    glances: list[torch.Tensor] = []
+    samples: list[torch.Tensor] = []
     for layer in network.decoder.layers:
-        layer.seen.register_forward_hook(lambda module, given, out: glances.append(given[0][0, :, 8:]))
+        layer.sample.register_forward_hook(lambda module, given, out: samples.append(given[0][0, :, 8:]))
     network.branches(torch.rand(1, 3, 64, 64), prompts)
-    assert len(glances) == 4  # two layers, two looks
-    return glances
+    assert len(samples) == 4  # two layers, two passes
+    return samples
 
 
-def code(rows: Sequence[int], columns: Sequence[int]) -> torch.Tensor:
+def encoding(rows: Sequence[int], columns: Sequence[int]) -> torch.Tensor:
     return position_encoding(16, 16, torch.zeros(1))[:, rows, columns].T
 
 
-def test_a_glance_is_what_is_seen_where_a_node_believes_its_keypoint_to_be() -> None:
-    """Certain maps of the other branch: each node sees the code of the one place, nothing else."""
+def test_a_node_samples_at_the_soft_argmax_of_its_keypoint() -> None:
+    """Certain maps of the other branch: each node samples the one cell, nothing else."""
     pixels = torch.zeros(1, 5, 16, 16)
     for k in range(5):
         pixels[0, k, 2 * k, 4] = 10
-    for seen in glances_at(pixels):
-        torch.testing.assert_close(seen, code([0, 2, 4, 6, 8], [4] * 5), atol=1e-5, rtol=1e-4)
+    for sample in sampled(pixels):
+        torch.testing.assert_close(sample, encoding([0, 2, 4, 6, 8], [4] * 5), atol=1e-5, rtol=1e-4)
 
 
-def test_in_the_second_look_a_node_takes_a_side() -> None:
-    """Between two places at .6 and .4 it sees their mean at first, then .84 of the likelier: .6^4 / (.6^4 + .4^4)."""
+def test_in_the_second_pass_the_likelier_position_dominates() -> None:
+    """Of two positions at .6 and .4 it samples their mean first, then .84 of the likelier: .6^4 / (.6^4 + .4^4)."""
     pixels = torch.full((1, 2, 16, 16), -10.0)
     pixels[0, :, 3, 2] = np.log(0.6) / SHARPNESS
     pixels[0, :, 12, 9] = np.log(0.4) / SHARPNESS
-    likelier, other = code([3], [2]), code([12], [9])
+    likelier, other = encoding([3], [2]), encoding([12], [9])
     share = 0.6**4 / (0.6**4 + 0.4**4)
-    first, second = glances_at(pixels)[1:3]
+    first, second = sampled(pixels)[1:3]
     torch.testing.assert_close(first, (0.6 * likelier + 0.4 * other).expand(2, -1), atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(second, (share * likelier + (1 - share) * other).expand(2, -1), atol=1e-5, rtol=1e-4)
 
 
-def test_a_node_that_is_told_sees_the_truth_in_its_second_look_alone() -> None:
+def test_a_prompted_node_samples_at_the_truth_in_the_second_pass_alone() -> None:
     pixels, truth = torch.zeros(1, 3, 16, 16), torch.zeros(1, 3, 16, 16)
     pixels[0, :, 5, 5] = 10
     truth[0, :, 11, 7] = 0.25  # maps of any sum
-    glances = glances_at(pixels, KeypointPrompts(truth, torch.tensor([[True, False, True]])))
-    for seen in glances[:2]:
-        torch.testing.assert_close(seen, code([5, 5, 5], [5, 5, 5]), atol=1e-5, rtol=1e-4)
-    for seen in glances[2:]:
-        torch.testing.assert_close(seen, code([11, 5, 11], [7, 5, 7]), atol=1e-5, rtol=1e-4)
+    samples = sampled(pixels, KeypointPrompts(truth, torch.tensor([[True, False, True]])))
+    for sample in samples[:2]:
+        torch.testing.assert_close(sample, encoding([5, 5, 5], [5, 5, 5]), atol=1e-5, rtol=1e-4)
+    for sample in samples[2:]:
+        torch.testing.assert_close(sample, encoding([11, 5, 11], [7, 5, 7]), atol=1e-5, rtol=1e-4)
 
 
-def test_what_a_node_is_told_reaches_its_neighbours_in_the_second_look() -> None:
-    for graph, heard in (("identity", False), ("skeleton", True)):
+def test_a_prompt_reaches_the_neighbours_in_the_second_pass() -> None:
+    for graph, reached in (("identity", False), ("skeleton", True)):
         network = tiny(5, graph).eval()
         torch.nn.init.normal_(network.node_filter.weight)
         image, truth = torch.rand(1, 3, 64, 64), torch.zeros(1, 5, 16, 16)
         truth[0, 0, 2, 3] = 1
-        told = torch.zeros(1, 5, dtype=torch.bool)
-        before = network.branches(image, KeypointPrompts(truth, told))
-        told[0, 0] = True
-        after = network.branches(image, KeypointPrompts(truth, told))
+        prompted = torch.zeros(1, 5, dtype=torch.bool)
+        before = network.branches(image, KeypointPrompts(truth, prompted))
+        prompted[0, 0] = True
+        after = network.branches(image, KeypointPrompts(truth, prompted))
         assert before.nodes is not None
         assert after.nodes is not None
         changed = (before.nodes - after.nodes).abs().amax(dim=(0, 2, 3)) > 1e-5
-        assert changed.tolist() == [True, heard, heard, False, False]  # two layers, two edges far
-        torch.testing.assert_close(before.first, after.first)
+        assert changed.tolist() == [True, reached, reached, False, False]  # two layers, two edges far
+        torch.testing.assert_close(before.first_pass, after.first_pass)
 
 
-def test_a_network_that_looks_once_takes_no_hints() -> None:
+def test_a_network_with_one_pass_takes_no_prompts() -> None:
     assert tiny(4).two_pass
     network = tiny(4, "none")
     assert not network.two_pass
-    assert network.branches(torch.rand(1, 3, 64, 64)).first is None
+    assert network.branches(torch.rand(1, 3, 64, 64)).first_pass is None
 
 
-def test_without_edges_no_node_hears_of_another() -> None:
-    """Otherwise the ablation of the edges would not be one of the graph. Only the attitude knows of all keypoints."""
-    for graph, heard in (("identity", False), ("skeleton", True)):
+def test_without_edges_no_node_reaches_another() -> None:
+    """Otherwise the ablation of the edges would not be one of the graph. Only the attitude depends on all keypoints."""
+    for graph, reached in (("identity", False), ("skeleton", True)):
         network = tiny(5, graph, bins=0).eval()
         torch.nn.init.normal_(network.fusion.join.weight)
         torch.nn.init.normal_(network.node_filter.weight)
@@ -222,11 +223,11 @@ def test_without_edges_no_node_hears_of_another() -> None:
         assert after is not None
         changed = (before - after).abs().amax(dim=(0, 2, 3)) > 1e-5
         assert changed[2]
-        assert changed[[1, 3]].all() == heard
-        assert changed[[0, 1, 3, 4]].any() == heard
+        assert changed[[1, 3]].all() == reached
+        assert changed[[0, 1, 3, 4]].any() == reached
 
 
-def test_every_picture_of_a_batch_is_mixed_by_the_same_matrix() -> None:
+def test_every_image_of_a_batch_is_mixed_by_the_same_matrix() -> None:
     torch.manual_seed(3)
     adjacency = normalised_adjacency(chain(5))
     layer = GraphConvolution(adjacency, 8, 8)

@@ -1,4 +1,4 @@
-"""Laws of the networks: shapes at every size and N, names and sizes, beliefs."""
+"""Laws of the networks: shapes at every size and number of keypoints, names and sizes, probabilities."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_any_number_of_keypoints_and_any_input_size(count: int, size: int) -> No
 
 
 @pytest.mark.parametrize("graph", ["skeleton", "identity", "none"])
-def test_the_forward_pass_is_the_belief_of_the_fused_branches(graph: str) -> None:
+def test_the_heatmaps_are_those_of_the_fused_branches(graph: str) -> None:
     network = tiny(5, graph).eval()
     image = torch.rand(1, 3, 64, 64)
     branches = network.branches(image)
@@ -49,13 +49,13 @@ def test_the_forward_pass_is_the_belief_of_the_fused_branches(graph: str) -> Non
     assert (branches.nodes is None) == (graph == "none")
 
 
-def test_a_belief_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
+def test_a_probability_sums_to_one_and_certainty_is_the_target_gaussian() -> None:
     maps = torch.randn(2, 3, 16, 16)
     torch.testing.assert_close(log_probability(maps).exp().sum(dim=2), torch.ones(2, 3))
     target = gaussian_targets(torch.tensor([[[33.0, 30.5]]]), 4, 16, 16, SIGMA_CELLS)
     torch.testing.assert_close(expected_heatmaps(target.log() / SHARPNESS), target, atol=1e-4, rtol=0)
-    twins = (target + target.flip(3)) / 2  # two places, equally likely: two peaks of half the height
-    torch.testing.assert_close(expected_heatmaps(twins.log() / SHARPNESS), twins, atol=1e-4, rtol=0)
+    both = (target + target.flip(3)) / 2  # two positions, equally likely: two peaks of half the height
+    torch.testing.assert_close(expected_heatmaps(both.log() / SHARPNESS), both, atol=1e-4, rtol=0)
 
 
 def test_without_edges_the_size_is_the_same() -> None:
@@ -119,7 +119,7 @@ def small_dmanet() -> DMANet:
     return DMANet(DMANetConfig((4, 6, 8, 10), (2, 4, 4, 6), (1, 2, 1, 2), head=12, bins=4))
 
 
-def test_dmanet_tells_a_pose_at_any_input_size() -> None:
+def test_dmanet_has_a_pose_at_any_input_size() -> None:
     network = small_dmanet()
     for size in (64, 128, 192):
         output = network(torch.rand(2, 3, size, size))
@@ -141,8 +141,8 @@ def test_gradients_reach_every_parameter_of_dmanet() -> None:
     assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
 
 
-def test_a_block_is_dense_and_looks_at_three_scales() -> None:
-    """What comes in goes out beside what is added; the convolutions of an MAB see 3, 5 and 7 cells across."""
+def test_a_block_is_dense_and_has_three_scales() -> None:
+    """What comes in goes out beside what is added; the convolutions of an MAB are 3, 5 and 7 cells wide."""
     block = MultiScaleAttention(5, 4).eval()
     x = torch.randn(1, 5, 16, 16)
     out = block(x)
@@ -156,7 +156,7 @@ def test_a_block_is_dense_and_looks_at_three_scales() -> None:
 
 
 def test_votes_for_the_origin_are_counted_from_each_cell() -> None:
-    """Sure cells decide; a vote of nothing is the cell's own centre, in sides of the crop from its middle."""
+    """Certain cells decide; a vote of nothing is the cell's own centre, in sides of the crop from its middle."""
     votes = torch.zeros(1, 3, 4, 8)
     votes[0, 0, 3, 0] = 50.0
     torch.testing.assert_close(DMANet._offset(votes), torch.tensor([[0.5 / 8 - 0.5, 3.5 / 4 - 0.5]]))
@@ -194,12 +194,12 @@ def test_named_sizes(name: str, low: float, high: float) -> None:
     assert low < parameters(named(name)) < high
 
 
-def test_the_code_of_a_place_is_the_same_at_every_resolution() -> None:
+def test_the_encoding_of_a_position_is_the_same_at_every_resolution() -> None:
     fine, coarse = position_encoding(30, 30, torch.zeros(1)), position_encoding(10, 10, torch.zeros(1))
     torch.testing.assert_close(fine[:, 1::3, 1::3], coarse, atol=1e-5, rtol=0)
 
 
-def test_the_locator_speaks_of_probabilities_and_lengths() -> None:
+def test_the_locator_gives_probabilities_and_lengths() -> None:
     output = named("locator")(torch.rand(2, 3, 256, 256))
     assert output.shape == (2, 5, 64, 64)
     assert (output >= 0).all()

@@ -25,7 +25,8 @@ from gknet.inference.crop_pose import CropPose  # noqa: E402
 from gknet.inference.direct_estimator import DirectEstimator, decode_output  # noqa: E402
 from gknet.inference.load import load_estimator  # noqa: E402
 from gknet.network.build import build  # noqa: E402
-from gknet.network.dmanet import Branches, DMANet, DMANetConfig  # noqa: E402
+from gknet.network.direct_pose import PoseBranches  # noqa: E402
+from gknet.network.dmanet import DMANet, DMANetConfig  # noqa: E402
 from gknet.training.augment import Augmentation, craft_warp, rotation  # noqa: E402
 from gknet.training.batch import Loader, draw_box, draw_keypoints  # noqa: E402
 from gknet.training.cache import Cache, build_cache, cached_row, craft_window  # noqa: E402
@@ -138,7 +139,7 @@ def test_the_loss_is_nothing_at_the_truth_and_leaves_out_what_has_no_pose() -> N
     bins = AttitudeBins(8)
     pose = torch.tensor([[0.1, -0.2, 0.3, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0, 1.0]])
     label = torch.from_numpy(bins.soft_label(pose[:, 3:].numpy())).float()
-    true = Branches(pose[:, :2], pose[:, 2], label.clamp(min=1e-30).log())
+    true = PoseBranches(pose[:, :2], pose[:, 2], label.clamp(min=1e-30).log())
     both = torch.ones(2)
     assert direct_loss(true, pose, label, both).item() == pytest.approx(0, abs=1e-5)
     for moved in (

@@ -1,4 +1,4 @@
-"""What the loss of a keypoint network counts: both looks, and no keypoint that was told."""
+"""What the loss of a keypoint network counts: both passes, and no prompted keypoint in the second."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.network.heatmap import SIGMA_CELLS, Branches, KeypointPrompts  # noqa: E402
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapBranches, KeypointPrompts  # noqa: E402
 from gknet.training.batch import Batch  # noqa: E402
 from gknet.training.loss import gaussian_targets, heatmap_loss  # noqa: E402
-from gknet.training.tasks import ATTITUDE, FIRST_LOOK, KeypointTask  # noqa: E402
+from gknet.training.tasks import ATTITUDE_WEIGHT, FIRST_PASS_WEIGHT, KeypointTask  # noqa: E402
 from tests.training.toy import toy_spacecraft  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -27,24 +27,24 @@ BATCH = Batch(
 TRUTH = gaussian_targets(BATCH.points_px, 4, 16, 16, SIGMA_CELLS)
 
 
-class Answers(torch.nn.Module):
-    """A network that answers with given maps and keeps what it was told."""
+class Fixed(torch.nn.Module):
+    """A network with given maps that keeps its prompts."""
 
     loss, stride = "squared", 4
 
-    def __init__(self, branches: Branches) -> None:
+    def __init__(self, branches: HeatmapBranches) -> None:
         super().__init__()
-        self.answer, self.two_pass = branches, branches.first is not None
+        self.fixed, self.two_pass = branches, branches.first_pass is not None
         self.prompts: list[KeypointPrompts] = []
 
-    def branches(self, image: torch.Tensor, *prompts: KeypointPrompts) -> Branches:
+    def branches(self, image: torch.Tensor, *prompts: KeypointPrompts) -> HeatmapBranches:
         self.prompts += prompts
-        return self.answer
+        return self.fixed
 
 
-def loss(branches: Branches, auxiliary: float = 0.0) -> float:
+def loss(branches: HeatmapBranches, auxiliary: float = 0.0) -> float:
     task = KeypointTask(toy_spacecraft(), 64, auxiliary)
-    return task.loss(Answers(branches), BATCH, CPU).item()
+    return task.loss(Fixed(branches), BATCH, CPU).item()
 
 
 def wrong(picture: int, keypoint: int) -> torch.Tensor:
@@ -53,33 +53,33 @@ def wrong(picture: int, keypoint: int) -> torch.Tensor:
     return maps
 
 
-def test_a_network_that_looks_twice_is_told_the_truth_of_the_told() -> None:
-    network = Answers(Branches(TRUTH, TRUTH, TRUTH, TRUTH))
+def test_a_two_pass_network_receives_the_truth_of_prompted_keypoints() -> None:
+    network = Fixed(HeatmapBranches(TRUTH, TRUTH, TRUTH, TRUTH))
     assert KeypointTask(toy_spacecraft(), 64, 0.2).loss(network, BATCH, CPU) == 0
     (prompts,) = network.prompts
     assert torch.equal(prompts.maps, TRUTH)
-    assert torch.equal(prompts.told, BATCH.told)
+    assert torch.equal(prompts.prompted, BATCH.told)
 
 
-def test_the_told_keypoints_count_in_the_first_look_alone() -> None:
-    told, untold = wrong(0, 2), wrong(0, 3)
-    assert loss(Branches(told, TRUTH, told, TRUTH), 0.2) == 0
-    assert loss(Branches(untold, TRUTH, TRUTH, TRUTH)) > 0
-    for maps in (told, untold):
-        expected = FIRST_LOOK * heatmap_loss(maps, TRUTH, BATCH.weight).item()
-        assert loss(Branches(TRUTH, TRUTH, TRUTH, maps)) == pytest.approx(expected)
+def test_prompted_keypoints_count_in_the_first_pass_alone() -> None:
+    prompted, other = wrong(0, 2), wrong(0, 3)
+    assert loss(HeatmapBranches(prompted, TRUTH, prompted, TRUTH), 0.2) == 0
+    assert loss(HeatmapBranches(other, TRUTH, TRUTH, TRUTH)) > 0
+    for maps in (prompted, other):
+        expected = FIRST_PASS_WEIGHT * heatmap_loss(maps, TRUTH, BATCH.weight).item()
+        assert loss(HeatmapBranches(TRUTH, TRUTH, TRUTH, maps)) == pytest.approx(expected)
 
 
-def test_a_network_that_looks_once_answers_for_every_keypoint_in_view() -> None:
-    told, out_of_view = wrong(0, 2), wrong(0, 4)
-    expected = heatmap_loss(told, TRUTH, BATCH.weight).item()
+def test_a_network_with_one_pass_has_a_loss_on_every_keypoint_in_view() -> None:
+    in_view, out_of_view = wrong(0, 2), wrong(0, 4)
+    expected = heatmap_loss(in_view, TRUTH, BATCH.weight).item()
     assert expected > 0
-    assert loss(Branches(told, TRUTH, TRUTH)) == pytest.approx(expected)
-    assert loss(Branches(TRUTH, told, TRUTH), 0.2) == pytest.approx(0.2 * expected)
-    assert loss(Branches(out_of_view, out_of_view, out_of_view), 0.2) == 0
+    assert loss(HeatmapBranches(in_view, TRUTH, TRUTH)) == pytest.approx(expected)
+    assert loss(HeatmapBranches(TRUTH, in_view, TRUTH), 0.2) == pytest.approx(0.2 * expected)
+    assert loss(HeatmapBranches(out_of_view, out_of_view, out_of_view), 0.2) == 0
 
 
-def test_the_belief_in_the_attitude_is_answered_for_where_a_pose_is_known() -> None:
+def test_the_attitude_has_a_loss_where_a_pose_is_known() -> None:
     bins = AttitudeBins(4)
     quaternions = torch.nn.functional.normalize(torch.randn(2, 4), dim=1)
     label = torch.from_numpy(bins.soft_label(quaternions.numpy())).float()
@@ -88,12 +88,12 @@ def test_the_belief_in_the_attitude_is_answered_for_where_a_pose_is_known() -> N
     def counted(attitude: torch.Tensor, known: torch.Tensor, auxiliary: float = 0.2) -> float:
         task = KeypointTask(toy_spacecraft(), 64, auxiliary, bins)
         batch = replace(BATCH, pose=torch.where(known[:, None], pose, torch.nan))
-        return task.loss(Answers(Branches(TRUTH, TRUTH, None, None, attitude)), batch, CPU).item()
+        return task.loss(Fixed(HeatmapBranches(TRUTH, TRUTH, None, None, attitude)), batch, CPU).item()
 
     both, first, neither = torch.tensor([[True, True], [True, False], [False, False]])
     right, mixed = label.clamp(min=1e-12).log(), torch.zeros_like(label)
     assert counted(right, both) == pytest.approx(0, abs=1e-5)
-    divergence = (label * (label.clamp(min=1e-12) * len(label[0])).log()).sum(dim=1)  # from the even belief
-    assert counted(mixed, both) == pytest.approx(ATTITUDE * divergence.mean().item(), rel=1e-4)
-    assert counted(mixed, first) == pytest.approx(ATTITUDE * divergence[0].item(), rel=1e-4)
+    divergence = (label * (label.clamp(min=1e-12) * len(label[0])).log()).sum(dim=1)  # from equal probabilities
+    assert counted(mixed, both) == pytest.approx(ATTITUDE_WEIGHT * divergence.mean().item(), rel=1e-4)
+    assert counted(mixed, first) == pytest.approx(ATTITUDE_WEIGHT * divergence[0].item(), rel=1e-4)
     assert counted(mixed, neither) == 0

@@ -1,4 +1,4 @@
-"""The belief in the attitude of the whole spacecraft, and what it says of each keypoint's place."""
+"""The probability of the attitude, and what it and the keypoints imply about each other (decision 0016)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from torch.nn import functional
 
 from gknet.network.backbone import ConvNorm
 
-OPEN_MIND = 0.02
+PRIOR_FLOOR = 0.02
 """Added to a prior whose mean over the cells is 1: what the attitude excludes is unlikely, not impossible."""
 
-
-SIDE = 2
-"""Power to which the belief is raised before ways are told: a mean of two attitudes is none."""
+ATTITUDE_INVERSE_TEMPERATURE = 2
+"""Of the softmax over the classes that position votes use: the mean of two attitudes is no attitude."""
 
 
 class AttitudeHead(nn.Module):
-    """Coarse cells, which must know where they are, -> logits of the attitude's classes: each cell's say, averaged."""
+    """The coarsest feature map -> logits of the attitude classes, from the mean over its cells.
+
+    The features must contain the position of their cell, which the mean would lose otherwise.
+    """
 
     def __init__(self, inputs: int, width: int, classes: int) -> None:
         super().__init__()
@@ -30,53 +32,81 @@ class AttitudeHead(nn.Module):
 
 
 class AttitudePrior(nn.Module):
-    """Between the belief in the attitude and those in the keypoints' places: what each says of the other.
+    """From the attitude to the positions of keypoints and back.
 
-    A keypoint by itself may be in two minds about twin places; an attitude puts all keypoints on one side.
+    A single keypoint may be equally likely at two symmetric positions; an attitude places all keypoints consistently.
 
-    places      given as (k, n, cells, cells), `AttitudeBins.keypoint_prior`; kept as (n, cells cells, k)
-    keypoints   (k, n, 2) the same without the blur, `AttitudeBins.expected_keypoints`
-    gain        of what the attitude says, learnt; trust in what keypoints say, likewise: they err alike, so below 1
+    Attributes:
+        keypoint_prior: (n, cells * cells, k), the probability of each cell for each keypoint under each class.
+        expected_keypoints: (k, n, 2), x and y of each keypoint under each class, in fractions of the crop.
+        gain: Learnt weight of the log prior.
+        trust: Learnt weight of the evidence of the keypoints. It starts below 1, since their errors are correlated.
     """
 
-    places: Tensor
-    keypoints: Tensor
+    keypoint_prior: Tensor
+    expected_keypoints: Tensor
 
-    def __init__(self, places: Float[Tensor, "k n cells cells"], keypoints: Float[Tensor, "k n 2"]) -> None:
+    def __init__(
+        self, keypoint_prior: Float[Tensor, "k n cells cells"], expected_keypoints: Float[Tensor, "k n 2"]
+    ) -> None:
+        """Both arguments are as the functions of that name in `gknet.inference.attitude.AttitudeBins` give them."""
         super().__init__()
-        self.cells = places.shape[-1]
-        # Keypoint by keypoint, the classes last: read as it lies by both products. The spacecraft's, not the weights'.
-        self.register_buffer("places", places.flatten(2).permute(1, 2, 0).contiguous(), persistent=False)
-        self.register_buffer("keypoints", keypoints, persistent=False)
+        self.cells = keypoint_prior.shape[-1]
+        # Keypoints first and classes last: both products below read it as it lies in memory. These buffers belong to
+        # the spacecraft, not to the weights: they are computed, never loaded.
+        by_keypoint = keypoint_prior.flatten(2).permute(1, 2, 0).contiguous()
+        self.register_buffer("keypoint_prior", by_keypoint, persistent=False)
+        self.register_buffer("expected_keypoints", expected_keypoints, persistent=False)
         self.gain = nn.Parameter(torch.ones(1))
         self.trust = nn.Parameter(torch.full((1,), 0.3))
 
     def forward(self, attitude: Float[Tensor, "b k"], height: int, width: int) -> Float[Tensor, "b n height width"]:
-        """Logits of the attitude's classes -> the logarithm of where they expect each keypoint, about 0 in the mean."""
-        expected = self.places.flatten(0, 1) @ attitude.float().softmax(dim=1).T  # (n cells cells, b)
-        expected = expected.T.reshape(-1, len(self.places), self.cells, self.cells)
-        log_prior = (self.cells**2 * expected + OPEN_MIND).log()
+        """The log prior of each keypoint's position.
+
+        Args:
+            attitude: (b, k) logits of the classes.
+            height: Of the result, in cells.
+            width: Of the result, in cells.
+
+        Returns:
+            (b, n, height, width) logarithms of a density whose mean over the cells is about 1.
+        """
+        expected = self.keypoint_prior.flatten(0, 1) @ attitude.float().softmax(dim=1).T  # (n cells cells, b)
+        expected = expected.T.reshape(-1, len(self.keypoint_prior), self.cells, self.cells)
+        log_prior = (self.cells**2 * expected + PRIOR_FLOOR).log()
         return self.gain * functional.interpolate(log_prior, size=(height, width), mode="bilinear")
 
-    def votes(self, attitude: Float[Tensor, "b k"], found: Float[Tensor, "b n 2"]) -> Float[Tensor, "b to from 2"]:
-        """Where each keypoint must be by each other one: its place, and from there the way that the attitude tells.
+    def position_votes(
+        self, attitude: Float[Tensor, "b k"], positions: Float[Tensor, "b n 2"]
+    ) -> Float[Tensor, "b to from 2"]:
+        """The position of each keypoint according to each other one: that one's position plus the offset between them.
 
-        attitude   logits of its classes
-        found      x and y of each keypoint's place, in fractions of the picture, as the votes are
+        The offset is the difference of the two expected positions under the attitude. It is far more accurate than
+        the expected positions: errors of the crop, and many of those of the attitude, shift both ends of an edge alike.
 
-        Ways are far surer than places: what is wrong with the crop, and much of what is with the attitude, is common to
-        both ends of an edge.
+        Args:
+            attitude: (b, k) logits of the classes; no gradient flows back to them.
+            positions: (b, n, 2) x and y at which the keypoints were found, in fractions of the crop.
+
+        Returns:
+            (b, n, n, 2) in fractions of the crop: [:, i, j] is the vote of keypoint j for keypoint i.
         """
-        side_taken = (SIDE * attitude.detach().float()).softmax(dim=1)
-        expected = (side_taken @ self.keypoints.flatten(1)).reshape(found.shape)
-        return expected[:, :, None] + (found - expected)[:, None]
+        sharpened = (ATTITUDE_INVERSE_TEMPERATURE * attitude.detach().float()).softmax(dim=1)
+        expected = (sharpened @ self.expected_keypoints.flatten(1)).reshape(positions.shape)
+        return expected[:, :, None] + (positions - expected)[:, None]
 
-    def evidence(self, belief: Float[Tensor, "b n h w"]) -> Float[Tensor, "b k"]:
-        """Where each keypoint is believed to be, shares of 1 -> what all of them together say of each class, in logits.
+    def evidence(self, probability: Float[Tensor, "b n h w"]) -> Float[Tensor, "b k"]:
+        """How well each class explains the positions of all keypoints together.
 
-        h and w are multiples of the cells. A class that suits all keypoints is far ahead of those that suit some.
+        Args:
+            probability: (b, n, h, w), summing to 1 over the cells of a map; h and w are multiples of `cells`.
+
+        Returns:
+            (b, k) terms to be added to the logits: the sum over the keypoints of the logarithm of the mean prior
+            density under the class, times `trust`. A class that places all keypoints well is far ahead of one that
+            places some.
         """
-        height, width = belief.shape[2:]
-        shares = functional.avg_pool2d(belief, (height // self.cells, width // self.cells)) * (height * width)
-        agreement = shares.flatten(2).transpose(0, 1) @ self.places  # (n, b, k)
-        return self.trust * (agreement + OPEN_MIND).log().sum(dim=0)
+        height, width = probability.shape[2:]
+        shares = functional.avg_pool2d(probability, (height // self.cells, width // self.cells)) * (height * width)
+        agreement = shares.flatten(2).transpose(0, 1) @ self.keypoint_prior  # (n, b, k)
+        return self.trust * (agreement + PRIOR_FLOOR).log().sum(dim=0)

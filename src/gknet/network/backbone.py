@@ -1,4 +1,4 @@
-"""What the networks share: a residual encoder, a feature pyramid, attention and the coding of positions."""
+"""What the networks share: a residual encoder, a feature pyramid, attention and the encoding of positions."""
 
 from __future__ import annotations
 
@@ -18,10 +18,17 @@ COARSEST = 32
 """The encoders' last stride: an input side is a multiple of it."""
 
 FREQUENCIES = (0.5, 1.0, 2.0, 4.0)
+"""Of the Fourier encoding, in periods per image side."""
+
 POSITION_WIDTH = 4 * len(FREQUENCIES)
 
 
 def check_input(image: Tensor) -> None:
+    """Refuse what is not (b, 3, h, w) with h and w multiples of the coarsest stride.
+
+    Raises:
+        GknetError: The shape is another one.
+    """
     if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % COARSEST or image.shape[3] % COARSEST:
         raise GknetError(
             f"network input: expected (b, 3, h, w) with h and w multiples of {COARSEST}, got {tuple(image.shape)}"
@@ -34,28 +41,39 @@ def normalised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
 
 
 def cell_centres(height: int, width: int, like: Tensor) -> Float[Tensor, "height width 2"]:
-    """x and y of the cells of a map, in fractions of it."""
+    """(height, width, 2), x and y of the centres of a map's cells in fractions of the image; device of `like`."""
     y = (torch.arange(height, device=like.device, dtype=torch.float32) + 0.5) / height
     x = (torch.arange(width, device=like.device, dtype=torch.float32) + 0.5) / width
     return torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], dim=2)
 
 
-def fourier_encoding(places: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
-    """Sines and cosines of x and y, in fractions of the picture.
+def fourier_encoding(positions: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 16"]:
+    """Sines and cosines of 2 pi f x and 2 pi f y at each of the FREQUENCIES f.
 
-    The same place of the picture has the same code at every resolution, so one network serves several input sizes.
+    The same position in the image has the same encoding at every resolution, so one network serves several input
+    sizes.
+
+    Args:
+        positions: (..., 2) x and y in fractions of the image.
+
+    Returns:
+        (..., POSITION_WIDTH).
     """
-    phase = places[..., None] * (2 * math.pi * torch.tensor(FREQUENCIES, device=places.device))  # (..., xy, frequency)
+    frequencies = 2 * math.pi * torch.tensor(FREQUENCIES, device=positions.device)
+    phase = positions[..., None] * frequencies  # (..., xy, frequency)
     return torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(-2)
 
 
-def position_encoding(height: int, width: int, like: Tensor) -> Float[Tensor, "c height width"]:
-    """The codes of the cells of a map."""
+def position_encoding(height: int, width: int, like: Tensor) -> Float[Tensor, "16 height width"]:
+    """The Fourier encodings of the centres of a map's cells: (POSITION_WIDTH, height, width)."""
     return fourier_encoding(cell_centres(height, width, like)).permute(2, 0, 1)
 
 
 class ConvNorm(nn.Module):
-    """Convolution, batch normalisation and, unless `relu` is False, a ReLU. `groups` = `inputs` is depthwise."""
+    """Convolution, batch normalisation and, unless `relu` is False, a ReLU. `groups` = `inputs` is depthwise.
+
+    (b, inputs, h, w) -> (b, outputs, h / stride, w / stride)
+    """
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, relu: bool = True, groups: int = 1
@@ -85,7 +103,11 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """ResNet-18's shape at any width: five down-samplings, features at strides 4, 8, 16 and 32."""
+    """ResNet-18's shape at any width: five down-samplings, features at strides 4, 8, 16 and 32.
+
+    Attributes:
+        widths: Channels of the four feature maps.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -102,7 +124,7 @@ class Encoder(nn.Module):
             inputs = outputs
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Tensor]:
-        """[(b, w, h/4, w/4), (b, 2w, h/8, ..), (b, 4w, h/16, ..), (b, 8w, h/32, ..)]"""
+        """Features (b, widths[i], h / s, w / s) at strides s of 4, 8, 16 and 32."""
         x = self.pool(self.stem(normalised(image)))
         features = []
         for stage in self.stages:
@@ -112,7 +134,7 @@ class Encoder(nn.Module):
 
 
 class Pyramid(nn.Module):
-    """From the coarsest feature map up to stride 4, meeting the encoder's map at each level."""
+    """From the coarsest feature map up to stride 4, with the encoder's map added at each level."""
 
     def __init__(self, widths: tuple[int, ...], width: int) -> None:
         super().__init__()
@@ -128,7 +150,7 @@ class Pyramid(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention of `width` channels from queries to a memory."""
+    """Multi-head attention of `width` channels from queries to a memory: softmax(q k^T / sqrt(c / heads)) v."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -148,7 +170,7 @@ class Attention(nn.Module):
 
 
 class ContextBlock(nn.Module):
-    """A transformer layer over the cells of the coarsest map: every part of the craft hears of every other."""
+    """A transformer layer over the cells of the coarsest map: every part of the image reaches every other one."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

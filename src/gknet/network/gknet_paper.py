@@ -1,12 +1,22 @@
-"""GKNet as the paper describes it, as large as the authors' (about 90 M): a U-Net decoded to full size, 32x32 heatmaps.
+"""GKNet as the paper describes it, as large as the authors' (about 90 M parameters).
 
-Where the paper is silent we chose: channels 64 to 1024 with two 3x3 convolutions a level, skips at every level, an
-8x8 convolution of stride 8 from F' to F'', three graph layers of 512 channels, and C_out = H W, so that a node's
-output is its keypoint's map.
+The flow of data, for b images of h x w with n keypoints:
 
-The paper makes the nodes of F by one reshaping, which fixes their number, and takes the linear layer behind eq. 2 from
-GraphCape. From there we took the nodes themselves too: one learned query for each keypoint, which attends to the cells
-of F (with their places) before each graph layer; residuals and LayerNorms about both. W_adj has a bias.
+    image (b, 3, h, w)
+      |
+    down: U-Net encoder -> skips at strides 1 to 16, F (b, 1024, h/32, w/32)
+      |-- up: U-Net decoder -> F' (b, 64, h, w) -> pixel_head -> F'' (b, n, h/8, w/8)        eq. 1
+      |-- cells of F + position -> memory (b, h/32 w/32, 512)
+      |     GraphDecoder: eq. 2 and 3 -> nodes (b, n, 512) -> node_map -> (b, n, 32, 32), resized to h/8 x w/8
+    Fusion -> fused maps (b, n, h/8, w/8)
+
+The paper does not state the channels (here 64 to 1024), the convolutions per level (two of 3x3), the skips (at every
+level), the step from F' to F'' (an 8x8 convolution of stride 8), or the size of the graph branch (three layers of 512
+channels, C_out = H W, so that a node's output is the map of its keypoint).
+
+The paper makes the nodes from F by one reshaping, which fixes their number, and takes the linear layer behind eq. 2
+from GraphCape. The nodes here follow GraphCape too: one learnt query per keypoint attends to the cells of F (with their
+positions) before each graph layer, with residuals and LayerNorms around both. W_adj has a bias.
 """
 
 from __future__ import annotations
@@ -21,7 +31,7 @@ from torch.nn import functional
 
 from gknet.network.backbone import POSITION_WIDTH, ConvNorm, check_input, normalised, position_encoding
 from gknet.network.graph import Fusion, GraphDecoder, normalised_adjacency
-from gknet.network.heatmap import Branches, HeatmapNetwork
+from gknet.network.heatmap import HeatmapBranches, HeatmapNetwork
 from gknet.network.spec import checked_graph
 
 PAPER_INPUT = 256
@@ -30,7 +40,16 @@ PAPER_INPUT = 256
 
 @dataclass(frozen=True)
 class GKNetPaperConfig:
-    """base: channels at full resolution; node_*, heads: of the graph decoder; graph: as in gknet-s."""
+    """Sizes of the network.
+
+    Attributes:
+        base: Channels at full resolution.
+        node_width: Channels of a graph node.
+        node_hidden: Channels of the graph convolution (eq. 2).
+        node_layers: Layers of the graph decoder.
+        heads: Attention heads.
+        graph: As in `gknet.network.gknet.GKNetConfig`.
+    """
 
     base: int = 64
     node_width: int = 512
@@ -73,7 +92,7 @@ class GKNetPaper(HeatmapNetwork):
             nn.init.normal_(self.node_map.weight, std=1e-4)
             self.fusion = Fusion(keypoints)
 
-    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> HeatmapBranches:
         check_input(image)
         x = normalised(image)
         skips = []
@@ -86,9 +105,9 @@ class GKNetPaper(HeatmapNetwork):
             x = block(torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), skip], dim=1))
         pixels = self.pixel_head(x)  # eq. 1
         if self.decoder is None:
-            return Branches(pixels, pixels, None)
+            return HeatmapBranches(pixels, pixels, None)
         nodes = self._node_maps(coarse, pixels)
-        return Branches(self.fusion(pixels, nodes), pixels, nodes)
+        return HeatmapBranches(self.fusion(pixels, nodes), pixels, nodes)
 
     def _node_maps(self, coarse: Float[Tensor, "b c h w"], pixels: Tensor) -> Float[Tensor, "b n h8 w8"]:
         assert self.decoder is not None

@@ -17,10 +17,15 @@ from gknet.network.spec import Graph
 
 
 def normalised_adjacency(adjacency: Bool[ndarray, "n n"], graph: Graph = "skeleton") -> Float[Tensor, "n n"]:
-    """D^-1/2 A D^-1/2 of the binary, symmetric A with ones on its diagonal (eq. 3).
+    """A~ = D^-1/2 A D^-1/2 of the binary, symmetric A with ones on its diagonal (eq. 3).
 
-    The ablations at equal size: `identity` forgets the edges, so nodes keep their layers and do not mix; `random` has
-    as many edges as the skeleton, between pairs drawn once and for all.
+    Args:
+        adjacency: (n, n), True where two keypoints share an edge, and on the diagonal.
+        graph: Ablations of equal size: "identity" drops the edges, so nodes keep their layers and do not mix;
+            "random" has as many edges as the skeleton, between pairs that are drawn once and for all.
+
+    Raises:
+        GknetError: The matrix is no adjacency.
     """
     matrix = np.asarray(adjacency, dtype=np.float64)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
@@ -45,7 +50,11 @@ def _random_adjacency(count: int, edges: int) -> Float[ndarray, "n n"]:
 
 
 class GraphConvolution(nn.Module):
-    """sigma(W F A~) of eq. 2 and the linear layer behind it that keeps nodes apart (GraphCape)."""
+    """sigma(W F A~) of eq. 2, followed by the linear layer that keeps nodes apart (GraphCape).
+
+    Attributes:
+        adjacency: (n, n) A~. It belongs to the spacecraft, not to the weights: it is rebuilt, never loaded.
+    """
 
     adjacency: Tensor
 
@@ -53,7 +62,6 @@ class GraphConvolution(nn.Module):
         super().__init__()
         self.mix = nn.Linear(width, hidden)
         self.linear = nn.Linear(hidden, width)
-        # The skeleton belongs to the spacecraft, not to the weights: it is rebuilt, never loaded.
         self.register_buffer("adjacency", adjacency, persistent=False)
 
     def forward(self, nodes: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
@@ -62,10 +70,10 @@ class GraphConvolution(nn.Module):
 
 
 class EdgeConvolution(nn.Module):
-    """Messages along the edges that know both of their ends (EdgeConv, Wang et al. 2019), summed as A~ weighs them.
+    """Messages that depend on both ends of their edge (EdgeConv, Wang et al. 2019), summed with the weights of A~.
 
-    Under eq. 2 a node tells all its neighbours the same; here it can tell each where that one must be. `votes` are the
-    codes of such places (decision 0016), of POSITION_WIDTH; a decoder without them says nothing of places.
+    Under eq. 2, a node sends the same message to all of its neighbours; here each neighbour receives its own. With
+    position votes, a message also contains the receiver's position according to the sender (decision 0016).
     """
 
     adjacency: Tensor
@@ -74,67 +82,79 @@ class EdgeConvolution(nn.Module):
         super().__init__()
         self.receive = nn.Linear(width, hidden)
         self.send = nn.Linear(width, hidden)
-        self.place = nn.Linear(POSITION_WIDTH, hidden, bias=False) if votes else None
+        self.position = nn.Linear(POSITION_WIDTH, hidden, bias=False) if votes else None
         self.linear = nn.Linear(hidden, width)
         self.register_buffer("adjacency", adjacency, persistent=False)
 
     def forward(
-        self, nodes: Float[Tensor, "b n c"], votes: Float[Tensor, "b to from p"] | None = None
+        self, nodes: Float[Tensor, "b n c"], position_votes: Float[Tensor, "b to from p"] | None = None
     ) -> Float[Tensor, "b n c"]:
-        said = self.receive(nodes)[:, :, None] + self.send(nodes)[:, None]  # (b, to, from, c)
-        if votes is not None and self.place is not None:
-            said = said + self.place(votes)
-        messages = functional.relu(said)
+        """The sum of the messages that each node receives.
+
+        Args:
+            nodes: (b, n, c).
+            position_votes: (b, n, n, 16) Fourier encodings of the positions that senders vote for; None in a first
+                pass.
+        """
+        messages = self.receive(nodes)[:, :, None] + self.send(nodes)[:, None]  # (b, to, from, c)
+        if position_votes is not None and self.position is not None:
+            messages = messages + self.position(position_votes)
+        messages = functional.relu(messages)
         return self.linear((self.adjacency.to(messages.dtype)[:, :, None] * messages).sum(dim=2))
 
 
-Glance = Callable[[Tensor], Tensor]
-"""Nodes (b, n, c) -> what is seen where each of them believes its keypoint to be (b, n, p)."""
+SampleFeatures = Callable[[Tensor], Tensor]
+"""Nodes (b, n, c) -> pixel features at the position of each node's keypoint (b, n, s)."""
 
 
 class GraphLayer(nn.Module):
-    """Nodes look at the picture, then talk along the edges; each with a residual and a LayerNorm.
+    """Nodes attend to the image, sample pixel features and exchange messages.
 
-    The edges are the only way from node to node, so that an ablation of the edges is one of the graph.
-    With a width of glances, nodes say in between where they believe their keypoints to be and see what is there, and
-    messages know both ends; without one (0) messages are those of eq. 2.
+    Each of the three steps has a residual and a LayerNorm. The edges are the only path between nodes, so that an
+    ablation of the edges is one of the graph. Without feature sampling (`sample_width` 0), messages are those of eq. 2.
     """
 
     def __init__(
-        self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, glance: int, votes: bool
+        self, adjacency: Float[Tensor, "n n"], width: int, hidden: int, heads: int, sample_width: int, votes: bool
     ) -> None:
         super().__init__()
-        self.look = Attention(width, heads)
-        self.after_look = nn.LayerNorm(width)
-        if glance:
-            self.seen = nn.Linear(glance, width)
-            self.after_seen = nn.LayerNorm(width)
+        self.attention = Attention(width, heads)
+        self.attention_norm = nn.LayerNorm(width)
+        if sample_width:
+            self.sample = nn.Linear(sample_width, width)
+            self.sample_norm = nn.LayerNorm(width)
         self.graph: EdgeConvolution | GraphConvolution
-        if glance:
+        if sample_width:
             self.graph = EdgeConvolution(adjacency, width, hidden, votes)
         else:
             self.graph = GraphConvolution(adjacency, width, hidden)
-        self.after_graph = nn.LayerNorm(width)
+        self.graph_norm = nn.LayerNorm(width)
 
     def forward(
         self,
         nodes: Float[Tensor, "b n c"],
         memory: Float[Tensor, "b m c"],
-        glance: Glance | None,
-        votes: Float[Tensor, "b to from p"] | None,
+        sample_features: SampleFeatures | None,
+        position_votes: Float[Tensor, "b to from p"] | None,
     ) -> Float[Tensor, "b n c"]:
-        nodes = self.after_look(nodes + self.look(nodes, memory))
-        if glance is not None:
-            nodes = self.after_seen(nodes + self.seen(glance(nodes)))
-        told = self.graph(nodes, votes) if isinstance(self.graph, EdgeConvolution) else self.graph(nodes)
-        return self.after_graph(nodes + told)
+        nodes = self.attention_norm(nodes + self.attention(nodes, memory))
+        if sample_features is not None:
+            nodes = self.sample_norm(nodes + self.sample(sample_features(nodes)))
+        votes = (position_votes,) if isinstance(self.graph, EdgeConvolution) else ()
+        return self.graph_norm(nodes + self.graph(nodes, *votes))
 
 
 class GraphDecoder(nn.Module):
-    """One learned query per keypoint becomes that keypoint's node; any number of keypoints.
+    """One learnt query per keypoint becomes that keypoint's node; any number of keypoints.
 
-    glance  channels of what a node sees at a glance; 0 where it is given none
-    votes   whether nodes that glance tell each other places as well
+    Args:
+        adjacency: (n, n) A~ of eq. 3.
+        width: Channels c of a node.
+        hidden: Channels of a message.
+        heads: Of the attention to the image.
+        layers: How many.
+        sample_width: Channels of a feature sample; 0 without feature sampling.
+        votes: Whether messages contain position votes; only with feature sampling.
     """
 
     def __init__(
@@ -144,30 +164,42 @@ class GraphDecoder(nn.Module):
         hidden: int,
         heads: int,
         layers: int,
-        glance: int = 0,
+        sample_width: int = 0,
         votes: bool = False,
     ) -> None:
         super().__init__()
         self.queries = nn.Parameter(torch.randn(len(adjacency), width) * 0.5)
-        self.layers = nn.ModuleList([GraphLayer(adjacency, width, hidden, heads, glance, votes) for _ in range(layers)])
+        self.layers = nn.ModuleList(
+            [GraphLayer(adjacency, width, hidden, heads, sample_width, votes) for _ in range(layers)]
+        )
 
     def forward(
         self,
         memory: Float[Tensor, "b m c"],
-        glance: Glance | None = None,
-        votes: Float[Tensor, "b to from p"] | None = None,
+        sample_features: SampleFeatures | None = None,
+        position_votes: Float[Tensor, "b to from p"] | None = None,
     ) -> Float[Tensor, "b n c"]:
+        """One pass of the decoder.
+
+        Args:
+            memory: (b, m, c) cells of the image.
+            sample_features: Called between attention and messages of each layer, with the nodes.
+            position_votes: (b, n, n, 16) Fourier encodings, the same in each layer.
+
+        Returns:
+            (b, n, c) nodes.
+        """
         nodes = self.queries.expand(memory.shape[0], -1, -1)
         for layer in self.layers:
-            nodes = layer(nodes, memory, glance, votes)
+            nodes = layer(nodes, memory, sample_features, position_votes)
         return nodes
 
 
 class Fusion(nn.Module):
     """The maps of both branches, joined by a 1x1 convolution.
 
-    At the start the output is the up-sampling branch's map plus the node's map, keypoint by keypoint: neither branch
-    starves the other, and where the maps are logits a node can veto a twin's peak.
+    At the start of a training the output is the sum of the two maps of each keypoint: neither branch starves the
+    other, and where the maps are logits a node can veto the peak at a symmetric counterpart.
     """
 
     def __init__(self, keypoints: int) -> None:

@@ -1,4 +1,4 @@
-"""What every keypoint network answers with: maps that a loss sees, and the heatmaps that are decoded from them."""
+"""What every keypoint network returns: maps that a loss is computed on, and the heatmaps that are decoded from them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from typing import NamedTuple
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gknet.errors import GknetError
@@ -24,52 +24,71 @@ STRIDES = (4, 8)
 
 
 def log_probability(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n hw"]:
-    """Logarithm of the probability that a keypoint lies in a cell."""
+    """Logarithm of the probability that a keypoint lies in a cell, in float32.
+
+    Args:
+        maps: (b, n, h, w), one map per keypoint.
+
+    Returns:
+        (b, n, h w); its exponential sums to 1 over the cells.
+    """
     return (SHARPNESS * maps.float()).flatten(2).log_softmax(dim=2)
 
 
 def expected_heatmaps(maps: Float[Tensor, "b n h w"]) -> Float[Tensor, "b n h w"]:
-    """The belief times 2 pi sigma^2: the target Gaussian of peak 1, averaged over where the keypoint may be.
+    """The probability of each cell times 2 pi sigma^2.
 
-    That average is what a training by squared error tends to as well, so both are decoded alike.
+    This is the target Gaussian of peak 1, averaged over the possible positions of the keypoint. A training with the
+    squared error tends to the same average, so the heatmaps of both losses are decoded alike.
+
+    Args:
+        maps: (b, n, h, w), one map per keypoint.
     """
     return (2 * math.pi * SIGMA_CELLS**2 * log_probability(maps).exp()).reshape(maps.shape)
 
 
-class Branches(NamedTuple):
-    """The fused maps and their two parts, as the loss sees them. `nodes` is None without a graph branch.
+class HeatmapBranches(NamedTuple):
+    """The maps of a keypoint network, as the loss sees them: (b, n, h, w) each.
 
-    first     the maps of the first look of a network that looks twice, else None
-    attitude  (b, k) logits of the attitude's classes of a network that has a belief in it, else None
+    Attributes:
+        fused: Both branches, joined: the network's result.
+        pixels: Of the up-sampling branch.
+        nodes: Of the graph branch; None without one.
+        first_pass: Of the first decoder pass of a two-pass network; else None.
+        attitude: (b, k) logits of the attitude classes of a network with an attitude prior; else None.
     """
 
     fused: Tensor
     pixels: Tensor
     nodes: Tensor | None
-    first: Tensor | None = None
+    first_pass: Tensor | None = None
     attitude: Tensor | None = None
 
 
 class KeypointPrompts(NamedTuple):
-    """Some keypoints' true places, told to a network in training before its second look.
+    """Teacher-forced keypoints: a two-pass network receives their true positions before its second pass.
 
-    maps (b, n, h, w) the target Gaussians; told (b, n) bool, whose place is told
+    Attributes:
+        maps: (b, n, h, w) target Gaussians of all keypoints.
+        prompted: (b, n), True where the network receives the position.
     """
 
-    maps: Tensor
-    told: Tensor
+    maps: Float[Tensor, "b n h w"]
+    prompted: Bool[Tensor, "b n"]
 
 
 class HeatmapNetwork(Network):
-    """Image -> one heatmap per keypoint, peak near 1; channel k is keypoint k.
+    """Image -> one heatmap per keypoint, with a peak near 1; channel k is keypoint k.
 
-    loss    "likelihood": the maps are logits of where the keypoint is (decision 0007); "squared": they are heatmaps
-    stride  input pixels per cell
+    Attributes:
+        loss: "likelihood": the maps are logits of the keypoint's position (decision 0007); "squared": they are
+            heatmaps.
+        stride: Input pixels per cell.
+        two_pass: Whether `branches` takes `KeypointPrompts`, as GKNet's does.
     """
 
     stride: int
     two_pass = False
-    """Whether `branches` takes prompts, as GKNet's does."""
 
     def __init__(self, loss: str, stride: int) -> None:
         super().__init__()
@@ -78,11 +97,22 @@ class HeatmapNetwork(Network):
         self.loss, self.stride = checked_loss(loss), stride
 
     @abstractmethod
-    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
-        """The maps and what each branch contributed, for a loss on all of them."""
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> HeatmapBranches:
+        """The maps of all branches.
+
+        Args:
+            image: (b, 3, h, w), RGB in 0 to 1.
+        """
 
     def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Heatmaps (b, n, hs, ws) and, of a network that has one, its belief in the attitude's classes (b, k)."""
+        """The heatmaps and, with an attitude prior, the probabilities of the attitude classes.
+
+        Args:
+            image: (b, 3, h, w), RGB in 0 to 1.
+
+        Returns:
+            (b, n, h / stride, w / stride) heatmaps, and (b, k) probabilities that sum to 1.
+        """
         branches = self.branches(image)
         heatmaps = expected_heatmaps(branches.fused) if self.loss == "likelihood" else branches.fused
         return (heatmaps,) if branches.attitude is None else (heatmaps, branches.attitude.softmax(dim=1))

@@ -17,18 +17,19 @@ from torch.nn import functional
 
 from gknet.errors import GknetError
 from gknet.network.backbone import ConvNorm, ResidualBlock, check_input, normalised
-from gknet.network.heatmap import Branches, HeatmapNetwork
+from gknet.network.heatmap import HeatmapBranches, HeatmapNetwork
 
 
 @dataclass(frozen=True)
 class HRNetConfig:
     """Sizes of the network; the defaults are HRNet-W32.
 
-    width          channels of the finest branch; each coarser one has twice as many
-    stem_width     channels of the stem; its bottlenecks have four times as many outside
-    bottlenecks    of the first stage, which has one branch
-    modules        of the second, third and fourth stage, which have two, three and four branches
-    blocks         residual blocks of a branch in a module
+    Attributes:
+        width: Channels of the finest branch; each coarser one has twice as many.
+        stem_width: Channels of the stem; its bottlenecks have four times as many outside.
+        bottlenecks: Of the first stage, which has one branch.
+        modules: Of the second, third and fourth stage, which have two, three and four branches.
+        blocks: Residual blocks of a branch in a module.
     """
 
     width: int = 32
@@ -128,7 +129,7 @@ class HRNet(HeatmapNetwork):
         nn.init.normal_(self.head.weight, std=0.001)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> HeatmapBranches:
         check_input(image)
         x = self.first(self.stem(normalised(image)))
         streams, coarsest = [self.begin(x)], x
@@ -138,4 +139,4 @@ class HRNet(HeatmapNetwork):
                 streams = module(streams)
             coarsest = streams[-1]
         maps = self.head(self.narrow(streams[0]))
-        return Branches(maps, maps, None)
+        return HeatmapBranches(maps, maps, None)

@@ -1,4 +1,4 @@
-"""The locator: where in the whole picture is the spacecraft? A centre map and four distances (CenterNet, FCOS)."""
+"""The locator finds the spacecraft in the whole image: a centre map and four distances (CenterNet, FCOS)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from gknet.network.network import Network
 
 @dataclass(frozen=True)
 class LocatorConfig:
-    """width: channels of the encoder's first stage; pyramid_width: channels of the up-sampling branch."""
+    """Sizes of the network.
+
+    Attributes:
+        width: Channels of the encoder's first stage.
+        pyramid_width: Channels of the up-sampling branch.
+    """
 
     width: int = 16
     pyramid_width: int = 32
@@ -27,8 +32,7 @@ class LocatorConfig:
 
 
 class Locator(Network):
-    """Image -> (b, 5, h/4, w/4): the centre's heatmap in 0 to 1, then the distances from a cell's centre to the
-    box's left, top, right and bottom sides in units of the input's size."""
+    """Image -> the box of the spacecraft, from every cell."""
 
     stride = 4
 
@@ -43,6 +47,15 @@ class Locator(Network):
             self.head.bias.copy_(torch.tensor([-4.0, -1.5, -1.5, -1.5, -1.5]))  # type: ignore[union-attr]
 
     def predict(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 5 h4 w4"], ...]:
+        """The centre's heatmap and the box's distances.
+
+        Args:
+            image: (b, 3, h, w), RGB in 0 to 1.
+
+        Returns:
+            One tensor (b, 5, h/4, w/4): the centre's heatmap in 0 to 1, then the distances from a cell's centre to the
+            left, top, right and bottom side of the box, in units of the input's size.
+        """
         check_input(image)
         raw = self.head(self.pyramid(self.encoder(image))).float()
         return (torch.cat([torch.sigmoid(raw[:, :1]), functional.softplus(raw[:, 1:])], dim=1),)

@@ -16,12 +16,17 @@ from torch.nn import functional
 
 from gknet.errors import GknetError
 from gknet.network.backbone import ConvNorm, ResidualBlock, check_input, normalised
-from gknet.network.heatmap import Branches, HeatmapNetwork
+from gknet.network.heatmap import HeatmapBranches, HeatmapNetwork
 
 
 @dataclass(frozen=True)
 class ResUNetConfig:
-    """width: channels of the encoder's first stage; blocks: of each of its four stages. Default: ResNet-34."""
+    """Sizes of the network; the defaults are ResNet-34.
+
+    Attributes:
+        width: Channels of the encoder's first stage.
+        blocks: Residual blocks of each of its four stages.
+    """
 
     width: int = 64
     blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
@@ -58,7 +63,7 @@ class ResUNet(HeatmapNetwork):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    def branches(self, image: Float[Tensor, "b 3 h w"]) -> Branches:
+    def branches(self, image: Float[Tensor, "b 3 h w"]) -> HeatmapBranches:
         check_input(image)
         x = self.stem(normalised(image))
         skips = []
@@ -68,4 +73,4 @@ class ResUNet(HeatmapNetwork):
         for block, skip in zip(self.up, skips[-2::-1], strict=False):
             x = block(torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), skip], dim=1))
         maps = self.head(x)
-        return Branches(maps, maps, None)
+        return HeatmapBranches(maps, maps, None)

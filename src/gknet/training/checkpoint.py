@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from gknet.errors import GknetError
 from gknet.io.atomic import write_bytes
 from gknet.io.torch_file import load_torch_file
+from gknet.network.weight_names import with_current_names
 
 CHECKPOINT = "checkpoint.pt"
 BEST = "best.safetensors"
@@ -106,6 +107,7 @@ def load_weights(path: Path) -> dict[str, Tensor]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise GknetError(f"{path}: cannot read the weights ({error}); expected a .safetensors file") from error
+    tensors = with_current_names(tensors)
     return {name: tensor.float() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
 
 

@@ -28,10 +28,11 @@ from gknet.inference.onnx_session import open_session
 from gknet.io.atomic import write_bytes
 from gknet.io.spacecraft_file import spacecraft_from_toml
 from gknet.network.backbone import ConvNorm
-from gknet.network.build import Network, build
+from gknet.network.build import build
 from gknet.network.dmanet import DMANet
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.network.locator import Locator
+from gknet.network.network import Network
 from gknet.training.checkpoint import BEST, load_weights, save_weights
 from gknet.training.settings import TrainingRun, load_run
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from gknet.network.dmanet import Branches
+from gknet.network.direct_pose import PoseBranches
 from gknet.network.heatmap import log_probability
 
 TINY = 1e-12
@@ -70,7 +70,7 @@ def attitude_loss(
 
 
 def direct_loss(
-    branches: Branches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
+    branches: PoseBranches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
 ) -> Float[Tensor, ""]:
     """Smooth L1 of the offset and of log_depth, and the divergence of the attitude's belief from its soft label.
 

@@ -1,4 +1,4 @@
-"""What is trained: keypoints, a direct pose or the locator. A task draws samples, computes the loss and validates."""
+"""What is trained: keypoints, a pose or the locator. A task draws samples, computes the loss and validates."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from gknet.frame import Frame
 from gknet.inference.attitude import AttitudeBins
-from gknet.network.dmanet import DMANet
+from gknet.network.direct_pose import DirectNetwork
 from gknet.network.gknet import GKNet
-from gknet.network.heatmap import SIGMA_CELLS, HeatmapNetwork, KeypointPrompts
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapBranches, HeatmapNetwork, KeypointPrompts
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Draw, draw_box, draw_keypoints
 from gknet.training.loss import (
@@ -27,24 +27,30 @@ from gknet.training.loss import (
 )
 from gknet.training.validation import Validation, validate_direct, validate_keypoints, validate_locator
 
-FIRST_LOOK = 0.5
-"""Weight of the loss on a first look."""
+FIRST_PASS_WEIGHT = 0.5
+"""Of the loss on the maps of a first pass."""
 
-ATTITUDE = 0.5
-"""Weight of the loss on a keypoint network's belief in the attitude."""
+ATTITUDE_WEIGHT = 0.5
+"""Of the loss on the attitude of a keypoint network."""
 
 LOSSES = {"likelihood": likelihood_loss, "squared": heatmap_loss}
 
 
 @runtime_checkable
 class Task(Protocol):
-    @property
-    def draw(self) -> Draw: ...
+    """What the loop needs to know about the kind of a network."""
 
-    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]: ...
+    @property
+    def draw(self) -> Draw:
+        """Makes one sample from a row of the cache."""
+
+    def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
+        """The loss of one batch, with its graph."""
+
     def validate(
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
-    ) -> Validation: ...
+    ) -> Validation:
+        """The errors on `rows` of `frames`, with the deployed code."""
 
 
 def labelled(
@@ -59,10 +65,18 @@ def labelled(
 
 @dataclass(frozen=True)
 class KeypointTask:
-    """Maps against Gaussians, and a belief in the attitude's `bins`; `auxiliary` weighs each branch's own loss.
+    """Maps against Gaussians, and the attitude against its soft label.
 
-    A network that looks twice answers for its first look too, and is told some of the places before the second, so
-    that it learns what neighbours tell of a keypoint; for those that it was told it does not answer.
+    A two-pass network has a loss on its first pass too. Before the second pass it receives the true positions of some
+    keypoints, so that it learns what the neighbours of a known keypoint can conclude; these keypoints have no loss in
+    the second pass.
+
+    Attributes:
+        spacecraft: With its keypoints.
+        input_size: Side of the crops to validate on, in pixels.
+        auxiliary: Weight of the loss on the maps of each branch.
+        bins: Of the network's attitude; None without one.
+        draw: See `Task`.
     """
 
     spacecraft: Spacecraft
@@ -80,20 +94,25 @@ class KeypointTask:
         targets = gaussian_targets(points, keypoint_network.stride, height, width, SIGMA_CELLS)
         loss = torch.zeros((), device=device)
         if keypoint_network.two_pass:
-            told = batch.told.to(device)
-            branches = cast(GKNet, network).branches(image, KeypointPrompts(targets, told))
-            loss = loss + FIRST_LOOK * measure(cast(Tensor, branches.first), targets, weight)
-            weight = weight * ~told
+            prompted = batch.told.to(device)
+            branches = cast(GKNet, network).branches(image, KeypointPrompts(targets, prompted))
+            loss = loss + FIRST_PASS_WEIGHT * measure(cast(Tensor, branches.first_pass), targets, weight)
+            weight = weight * ~prompted
         else:
             branches = keypoint_network.branches(image)
         loss = loss + measure(branches.fused, targets, weight)
         if self.auxiliary > 0 and branches.nodes is not None:
             parts = measure(branches.pixels, targets, weight) + measure(branches.nodes, targets, weight)
             loss = loss + self.auxiliary * parts
-        if branches.attitude is not None and self.bins is not None:
-            _, label, known = labelled(batch, self.bins, device)
-            loss = loss + ATTITUDE * attitude_loss(branches.attitude, label, known)
-        return loss
+        return loss + self._attitude_loss(branches, batch, device)
+
+    def _attitude_loss(
+        self, branches: HeatmapBranches, batch: Batch, device: torch.device
+    ) -> Float[Tensor, ""] | float:
+        if branches.attitude is None or self.bins is None:
+            return 0.0
+        _, label, known = labelled(batch, self.bins, device)
+        return ATTITUDE_WEIGHT * attitude_loss(branches.attitude, label, known)
 
     def validate(
         self, network: nn.Module, device: torch.device, frames: Sequence[Frame], rows: Sequence[int]
@@ -103,7 +122,14 @@ class KeypointTask:
 
 @dataclass(frozen=True)
 class DirectTask:
-    """Offset, depth and attitude against the true pose as the crop shows it."""
+    """Offset, depth and attitude against the true pose relative to the crop.
+
+    Attributes:
+        spacecraft: With its keypoints.
+        bins: Of the network's attitude.
+        input_size: Side of the crops to validate on, in pixels.
+        draw: See `Task`.
+    """
 
     spacecraft: Spacecraft
     bins: AttitudeBins
@@ -111,7 +137,7 @@ class DirectTask:
     draw: Draw = draw_keypoints
 
     def loss(self, network: nn.Module, batch: Batch, device: torch.device) -> Float[Tensor, ""]:
-        branches = cast(DMANet, network).branches(batch.network_input(device))
+        branches = cast(DirectNetwork, network).branches(batch.network_input(device))
         return direct_loss(branches, *labelled(batch, self.bins, device))
 
     def validate(
@@ -122,7 +148,14 @@ class DirectTask:
 
 @dataclass(frozen=True)
 class LocatorTask:
-    """The box's centre and sides in the whole picture."""
+    """The box's centre and sides in the whole image.
+
+    Attributes:
+        spacecraft: With its keypoints, whose box is sought.
+        stride: Of the network.
+        input_size: Side of the images to validate on, in pixels.
+        draw: See `Task`.
+    """
 
     spacecraft: Spacecraft
     stride: int
