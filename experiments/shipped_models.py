@@ -42,8 +42,9 @@ from gknet.render.recipe import RECIPES
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights, save_weights
 from gknet.training.export import export_run
 from gknet.training.loop import train
+from gknet.training.run_file import load_run
 from gknet.training.schedule import Stage
-from gknet.training.settings import TrainSettings, load_run
+from gknet.training.settings import TrainSettings
 from gknet.training.setup import make_task
 from gknet.training.validation import validation_rows
 

@@ -97,20 +97,21 @@ class Frames:
 def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: Path) -> None:
     frames = Frames([a_frame((0.2 * k, 0, 12), 128) for k in range(5)], bad=1)
     said: list[str] = []
-    cache = build_cache(frames, CRAFT, tmp_path, 64, report=said.append)
+    place = tmp_path / "cache"
+    cache = build_cache(frames, CRAFT, place, 64, report=said.append)
     assert len(cache) == 4
     assert said == ["left out: frame 1: truncated"]
-    again = build_cache(frames, CRAFT, tmp_path, 64)
+    again = build_cache(frames, CRAFT, place, 64)
     assert frames.reads == 5
     np.testing.assert_array_equal(again.images, cache.images)
     frames.frames[0] = a_frame((0.0, 0.1, 12), 128)
-    assert not np.array_equal(build_cache(frames, CRAFT, tmp_path, 64).points_px[0], cache.points_px[0])
-    assert not list(tmp_path.glob("*.tmp"))
+    assert not np.array_equal(build_cache(frames, CRAFT, place, 64).points_px[0], cache.points_px[0])
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["cache"]  # the stale one is gone
 
 
 def test_the_cache_keeps_every_point_in_its_row_and_below_the_pixel(tmp_path: Path) -> None:
     frames = [a_frame((3.0 - k, 0.5, 12.0), 256) for k in range(3)]
-    cache = build_cache(Frames(frames), CRAFT, tmp_path, 96)
+    cache = build_cache(Frames(frames), CRAFT, tmp_path / "cache", 96)
     for row, frame in enumerate(frames):
         truth = frame.keypoints_px(POINTS)
         expected = craft_window(frame, box_of(frame), 96).to_input(truth)
@@ -121,7 +122,7 @@ def test_the_cache_keeps_every_point_in_its_row_and_below_the_pixel(tmp_path: Pa
 
 def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -> None:
     """One turn, scale and shift takes the points of the cache to those of the sample, row by row, to a thousandth."""
-    cache = build_cache(Frames([a_frame((3.0, 0.5, 12.0), 256), a_frame(size=256)]), CRAFT, tmp_path, 96)
+    cache = build_cache(Frames([a_frame((3.0, 0.5, 12.0), 256), a_frame(size=256)]), CRAFT, tmp_path / "cache", 96)
     masked = 0
     for seed in range(20):
         row = seed % 2
@@ -140,14 +141,14 @@ def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -
 def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
     for frames in ([], [a_frame((40.0, 0.0, 12.0), 64)]):
         with pytest.raises(GknetError, match="cache"):
-            build_cache(Frames(frames), CRAFT, tmp_path, 64)
-    assert not list(tmp_path.glob("*"))
+            build_cache(Frames(frames), CRAFT, tmp_path / "cache", 64)
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
 def loader(folder: Path, draw=draw_keypoints, **options: int) -> Loader:
     data = SkdDataset(folder, "train", "satellite_01")
     window = "picture" if draw is draw_box else "craft"
-    return Loader(build_cache(data, data.spacecraft, folder / "cache", 96, window), draw, 7, **options)
+    return Loader(build_cache(data, data.spacecraft, folder / f"cache_{window}", 96, window), draw, 7, **options)
 
 
 def test_an_epoch_shows_every_row_once(folder: Path) -> None:

@@ -130,7 +130,7 @@ def test_a_symmetric_lens_rolls_with_the_camera() -> None:
 
 def test_the_whole_picture_of_the_locator_has_its_pose_too(data: Path) -> None:
     dataset = SkdDataset(data, "train", "satellite_01")
-    cache = build_cache(dataset, dataset.spacecraft, data / "cache", 96, "picture")
+    cache = build_cache(dataset, dataset.spacecraft, data / "cache_picture", 96, "picture")
     sample = Loader(cache, draw_box, 0).sample(0, 64)
     assert np.isfinite(sample.pose).all()
 
@@ -186,7 +186,7 @@ def test_a_few_crops_are_learnt_by_heart() -> None:
 
 def test_a_frame_whose_origin_is_behind_the_camera_counts_for_nothing(data: Path) -> None:
     dataset = SkdDataset(data, "train", "satellite_01")
-    cache = build_cache(dataset, dataset.spacecraft, data / "cache", 96)
+    cache = build_cache(dataset, dataset.spacecraft, data / "cache_96", 96)
     blind = replace(cache, poses=np.full_like(cache.poses, np.nan))
     batch = Loader(blind, draw_keypoints, 0).batch(0, Stage(1, 64, 4))
     network = build("dmanet-xs", CRAFT.adjacency, CRAFT.points_m)

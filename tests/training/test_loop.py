@@ -23,8 +23,9 @@ from gknet.network.build import build  # noqa: E402
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
 from gknet.training.export import export_run  # noqa: E402
 from gknet.training.loop import train  # noqa: E402
+from gknet.training.run_file import load_run  # noqa: E402
 from gknet.training.schedule import Stage  # noqa: E402
-from gknet.training.settings import TrainSettings, load_run  # noqa: E402
+from gknet.training.settings import TrainSettings  # noqa: E402
 
 SETTINGS = TrainSettings(
     epochs=3,
@@ -74,22 +75,6 @@ def test_a_run_leaves_its_files(finished: Path) -> None:
     assert not list(finished.glob(".*.tmp"))
 
 
-def test_an_interrupted_run_resumes_to_the_same_weights(data: Path, finished: Path, tmp_path: Path) -> None:
-    def interrupt(samples: int) -> None:
-        if samples == 16:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(data, "satellite_01", tmp_path / "run", SETTINGS, quiet=True, on_step=interrupt)
-    assert saved(tmp_path / "run")["state"]["samples"] == 16
-    train(data, "satellite_01", tmp_path / "run", SETTINGS, resume=True, quiet=True)
-    straight, resumed = saved(finished), saved(tmp_path / "run")
-    for part in ("network", "average"):
-        for name, tensor in straight[part].items():
-            assert torch.equal(tensor, resumed[part][name]), f"{part}.{name}"
-    assert straight["state"]["best"] == resumed["state"]["best"]
-
-
 def test_a_finished_run_is_prolonged(data: Path, located: Path) -> None:
     before = saved(located)["state"]["samples"]
     state = train(
@@ -103,7 +88,8 @@ def test_a_run_is_not_overwritten_and_not_confused(data: Path, finished: Path, t
         train(data, "satellite_01", finished, SETTINGS, quiet=True)
     with pytest.raises(GknetError, match="another training"):
         train(data, "satellite_01", finished, replace(SETTINGS, network="locator"), resume=True, quiet=True)
-    for other in ({"graph": "identity"}, {"loss": "squared"}):  # the weights would fit
+    others = ({"graph": "identity"}, {"loss": "squared"}, {"stages": (Stage(1, 96, 4),)}, {"learning_rate": 1e-3})
+    for other in others:  # the weights would fit
         with pytest.raises(GknetError, match="another training"):
             train(data, "satellite_01", finished, replace(SETTINGS, **other), resume=True, quiet=True)
     with pytest.raises(GknetError, match="no checkpoint"):

@@ -7,8 +7,10 @@ import pytest
 pytest.importorskip("torch")
 
 from gknet.errors import GknetError
-from gknet.training.schedule import Budget, Stage, learning_rate, parse_stages, stage_at
-from gknet.training.settings import STAGES, TrainSettings
+from gknet.network.build import NETWORKS
+from gknet.network.spec import Stage
+from gknet.training.schedule import Budget, learning_rate, parse_stages, stage_at
+from gknet.training.settings import TrainSettings
 
 
 def test_stages_follow_their_shares() -> None:
@@ -25,9 +27,9 @@ def test_bad_stages_are_refused(text: str) -> None:
 
 
 def test_every_network_has_stages_that_fill_the_budget() -> None:
-    for stages in STAGES.values():
-        assert sum(stage.share for stage in stages) == pytest.approx(1)
-        assert stages[-1].input_size == 256
+    for spec in NETWORKS.values():
+        assert sum(stage.share for stage in spec.stages) == pytest.approx(1)
+        assert spec.stages[-1].input_size == 256
 
 
 def test_the_rate_rises_then_falls_to_zero() -> None:
@@ -48,8 +50,8 @@ def test_budgets_by_clock_and_by_samples() -> None:
 
 
 def test_settings_name_what_is_wrong() -> None:
-    for bad in ({}, {"minutes": 1, "epochs": 1}):
-        with pytest.raises(GknetError, match="minutes"):
+    for bad in ({}, {"minutes": 1, "epochs": 1}, {"samples": 9, "epochs": 1}):
+        with pytest.raises(GknetError, match="--samples, --epochs or --minutes"):
             TrainSettings(**bad)
     with pytest.raises(GknetError, match="network"):
         TrainSettings(epochs=1, network="hourglass")

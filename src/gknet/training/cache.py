@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import json
+import logging
 import os
+import secrets
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import BinaryIO, Literal, Protocol, runtime_checkable
 
 import numpy as np
+from filelock import FileLock
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
@@ -21,13 +26,18 @@ from gknet.inference.crop import Crop
 from gknet.inference.crop_pose import CropPose, has_square_pixels
 from gknet.spacecraft import Spacecraft
 
+logger = logging.getLogger(__name__)
+
 CACHE_MARGIN = 1.6
 """A cached crop's side over the longer side of the keypoints' box: room to turn and to shift."""
 
 WHOLE = 0.8
 """A crop that would cover this share of the picture's side takes the whole picture instead."""
 
-LAYOUT = 2
+LAYOUT = 3
+"""Of the files; a cache of another one is built anew."""
+
+IMAGES, LABELS, HEADER = "images.u8", "labels.npz", "cache.json"
 
 Window = Literal["craft", "picture"]
 
@@ -44,12 +54,13 @@ class FrameSource(Protocol):
 class Cache:
     """Square crops and their labels, in pixels of the crop.
 
-    images    (m, s, s, 3) uint8, memory-mapped
-    points_px (m, n, 2) the projected keypoints; NaN behind the camera
-    in_view   (m, n) the keypoint is inside the picture and inside the crop, hidden or not
-    boxes_px  (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the picture
-    poses     (m, 7) the true pose as the crop shows it, `CropPose.vector`; NaN where the origin is behind the camera
-              or pixels are not square, since a turned picture is of no pose then
+    Attributes:
+        images: (m, s, s, 3) uint8 RGB, memory-mapped.
+        points_px: (m, n, 2) the projected keypoints; NaN behind the camera.
+        in_view: (m, n) whether the keypoint is inside the picture and inside the crop, hidden or not.
+        boxes_px: (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the picture.
+        poses: (m, 7) the true pose as the crop shows it, `CropPose.vector`; NaN where the origin is behind the camera
+            or pixels are not square, since a rotated picture is of no pose then.
     """
 
     images: UInt8[ndarray, "m s s 3"]
@@ -63,6 +74,7 @@ class Cache:
 
     @property
     def size(self) -> int:
+        """Side of the crops in pixels."""
         return self.images.shape[1]
 
 
@@ -80,21 +92,22 @@ def craft_window(frame: Frame, box: Box, size: int) -> Crop:
     return whole if around.side >= WHOLE * whole.side else around
 
 
-def _label_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size: int, stamp: str) -> str:
-    """A name for the cache that changes with anything that it was made of."""
+def _content_key(frames: FrameSource, spacecraft: Spacecraft, window: Window, size: int, stamp: str) -> str:
+    """A digest that changes with anything that a cache is made of."""
     digest = hashlib.sha256(f"{LAYOUT} {window} {size} {CACHE_MARGIN} {WHOLE} {stamp}".encode())
     digest.update(np.append(spacecraft.points_m, spacecraft.diameter_m).tobytes())
     for i in range(len(frames)):
         try:
             frame = frames.frame(i, image=False)
         except GknetError as error:  # a bad label: the frame is left out, and reported when the cache is written
-            digest.update(str(error).encode())
+            digest.update(str(error).encode(errors="surrogateescape"))
             continue
-        digest.update(f"{frame.name} {frame.camera.width} {frame.camera.height}".encode())
+        name = frame.name.encode(errors="surrogateescape")
+        digest.update(name + f" {frame.camera.width} {frame.camera.height}".encode())
         digest.update(frame.camera.matrix.tobytes())
         if frame.cam_from_body is not None:
             digest.update(frame.cam_from_body.rotation.tobytes() + frame.cam_from_body.translation_m.tobytes())
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,42 +142,104 @@ def cached_row(frame: Frame, spacecraft: Spacecraft, window: Window, size: int) 
 def build_cache(
     frames: FrameSource,
     spacecraft: Spacecraft,
-    folder: Path,
+    place: Path,
     size: int,
     window: Window = "craft",
     stamp: str = "",
     workers: int = 2,
     advance: Callable[[int, int], None] = lambda done, total: None,
-    report: Callable[[str], None] = print,
+    report: Callable[[str], None] = logger.warning,
 ) -> Cache:
-    """The cache of `frames` under `folder`, built if it is not there. A bad frame is reported and left out.
+    """The cache of a dataset in the folder `place`, built when it is not there, damaged, or of other content.
 
-    stamp    stands for the pictures' content, such as sizes and times of the files
-    advance  is called with (done, total)
+    Args:
+        frames: The dataset. A frame that cannot be read is reported and left out.
+        spacecraft: Of the frames.
+        place: The folder of this cache alone. What else it holds is removed when the cache is built.
+        size: Side of the crops in pixels.
+        window: "craft" or "picture".
+        stamp: Stands for the pictures' content, such as sizes and times of the files.
+        workers: Threads.
+        advance: Called with (done, total) while the cache is built.
+        report: Called with a line for each frame that is left out.
+
+    Returns:
+        The cache.
+
+    Raises:
+        GknetError: The dataset has no frames, or none that shows the spacecraft.
     """
     if len(frames) == 0:
         raise GknetError("cache: the dataset has no frames for this split and spacecraft")
-    place = folder / _label_key(frames, spacecraft, window, size, stamp)
-    if not (place / "labels.npz").exists():
-        _write_cache(frames, spacecraft, place, size, window, workers, advance, report)
-    labels = np.load(place / "labels.npz")
-    count = len(labels["points_px"])
-    images = np.memmap(place / "images.u8", dtype=np.uint8, mode="r", shape=(count, size, size, 3))
+    key = _content_key(frames, spacecraft, window, size, stamp)
+    cache = _read_cache(place, key, size)
+    if cache is not None:
+        return cache
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(place.with_name(f".{place.name}.lock")):  # one process builds it, the others wait
+        cache = _read_cache(place, key, size)
+        if cache is None:
+            _write_cache(place, key, _rows(frames, spacecraft, window, size, workers, advance, report))
+            cache = _read_cache(place, key, size)
+    if cache is None:
+        raise GknetError(f"{place}: the cache does not read as it was written; is the disk in order?")
+    return cache
+
+
+def _header(key: str, count: int, labels: bytes) -> dict[str, object]:
+    return {"key": key, "count": count, "labels_sha256": hashlib.sha256(labels).hexdigest()}
+
+
+def _read_cache(place: Path, key: str, size: int) -> Cache | None:
+    """The cache in `place`; None where it is absent, damaged, or of other content."""
+    try:
+        header = json.loads((place / HEADER).read_bytes())
+        content = (place / LABELS).read_bytes()
+        if header != _header(key, header["count"], content):
+            return None
+        labels = np.load(io.BytesIO(content))
+        images = np.memmap(place / IMAGES, dtype=np.uint8, mode="r").reshape(header["count"], size, size, 3)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
     return Cache(images, labels["points_px"], labels["in_view"], labels["boxes_px"], labels["poses"])
 
 
-def _write_cache(
+def _write_cache(place: Path, key: str, rows: Iterable[_Row]) -> None:
+    """Put a cache of `rows` in `place`, instead of what is there."""
+    for left in place.parent.glob(f".{place.name}.*.tmp"):  # of builders that were killed
+        shutil.rmtree(left, ignore_errors=True)
+    temporary = place.with_name(f".{place.name}.{secrets.token_hex(8)}.tmp")
+    temporary.mkdir()
+    try:
+        kept = []
+        with open(temporary / IMAGES, "wb") as images:
+            for row in rows:
+                images.write(row.image.tobytes())
+                kept.append((row.points_px, row.in_view, row.box_px, row.pose))
+            _sync(images)
+        if not kept:
+            raise GknetError("cache: no frame shows the spacecraft; is this the right dataset?")
+        labels = _labels(kept)
+        for name, content in ((LABELS, labels), (HEADER, json.dumps(_header(key, len(kept), labels)).encode())):
+            with open(temporary / name, "wb") as file:
+                file.write(content)
+                _sync(file)
+        shutil.rmtree(place, ignore_errors=True)
+        os.replace(temporary, place)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _rows(
     frames: FrameSource,
     spacecraft: Spacecraft,
-    place: Path,
-    size: int,
     window: Window,
+    size: int,
     workers: int,
     advance: Callable[[int, int], None],
     report: Callable[[str], None],
-) -> None:
-    temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
-    temporary.mkdir(parents=True)
+) -> Iterator[_Row]:
+    """The rows of all frames that show the craft, in order and bounded in memory."""
 
     def row(i: int) -> _Row | str | None:
         try:
@@ -172,29 +247,30 @@ def _write_cache(
         except GknetError as error:
             return str(error)
 
-    kept: list[tuple[ndarray, ...]] = []
-    try:
-        with ThreadPoolExecutor(workers) as pool, open(temporary / "images.u8", "wb") as images:
-            for start in range(0, len(frames), 256):  # in order and bounded in memory
-                for done, item in enumerate(pool.map(row, range(start, min(start + 256, len(frames)))), start + 1):
-                    if isinstance(item, str):
-                        report(f"left out: {item}")
-                    elif item is not None:
-                        images.write(item.image.tobytes())
-                        kept.append((item.points_px, item.in_view, item.box_px, item.pose))
-                    advance(done, len(frames))
-        if not kept:
-            raise GknetError("cache: no frame shows the spacecraft; is this the right dataset?")
-        points, in_view, boxes, poses = (np.stack(column) for column in zip(*kept, strict=True))
-        np.savez(
-            temporary / "labels.npz",
-            points_px=points.astype(np.float32),
-            in_view=in_view,
-            boxes_px=boxes.astype(np.float32),
-            poses=poses.astype(np.float32),
-        )
-        if place.exists():  # another process was faster
-            return
-        os.replace(temporary, place)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with ThreadPoolExecutor(workers) as pool:
+        for start in range(0, len(frames), 256):
+            for done, item in enumerate(pool.map(row, range(start, min(start + 256, len(frames)))), start + 1):
+                if isinstance(item, str):
+                    report(f"left out: {item}")
+                elif item is not None:
+                    yield item
+                advance(done, len(frames))
+
+
+def _labels(rows: Sequence[tuple[ndarray, ...]]) -> bytes:
+    points, in_view, boxes, poses = (np.stack(column) for column in zip(*rows, strict=True))
+    content = io.BytesIO()
+    np.savez(
+        content,
+        points_px=points.astype(np.float32),
+        in_view=in_view,
+        boxes_px=boxes.astype(np.float32),
+        poses=poses.astype(np.float32),
+    )
+    return content.getvalue()
+
+
+def _sync(file: BinaryIO) -> None:
+    """On the disk before the header says so: a crash of the machine must not leave a cache of zeros."""
+    file.flush()
+    os.fsync(file.fileno())

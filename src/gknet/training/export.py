@@ -34,7 +34,7 @@ from gknet.network.heatmap import HeatmapNetwork
 from gknet.network.locator import Locator
 from gknet.network.network import Network
 from gknet.training.checkpoint import BEST, load_weights, save_weights
-from gknet.training.settings import TrainingRun, load_run
+from gknet.training.run_file import TrainingRun, load_run
 
 TOLERANCE = 1e-3
 """Largest difference between torch and onnxruntime: of a heatmap (its peak is 1), of a belief, of a crop's side."""

@@ -1,25 +1,29 @@
-"""The training loop, in one piece."""
+"""The training loop."""
 
 from __future__ import annotations
 
-import copy
 import math
 import time
-from collections.abc import Callable
-from contextlib import closing
-from dataclasses import asdict, replace
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import torch
+from lightning_fabric import Fabric
+from lightning_fabric.utilities.rank_zero import rank_zero_only
 
 from gknet import __version__
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import DivergedError, GknetError
+from gknet.frame import Frame
+from gknet.io.interrupt import Interrupted, Interruption
+from gknet.io.lock import LOCK_NAME, locked
 from gknet.io.spacecraft_file import spacecraft_toml
-from gknet.network.build import build
-from gknet.network.locator import Locator
-from gknet.training.batch import Loader
+from gknet.spacecraft import Spacecraft
+from gknet.training.batch import Batch, Loader
 from gknet.training.checkpoint import (
     BEST,
     CHECKPOINT,
@@ -27,17 +31,183 @@ from gknet.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
     save_weights,
-    warm_start,
 )
+from gknet.training.learner import Learner
 from gknet.training.metric_logger import MetricLogger
-from gknet.training.optimizer import make_optimizer
-from gknet.training.schedule import Budget, learning_rate, stage_at
-from gknet.training.settings import TrainingRun, TrainSettings
-from gknet.training.setup import check_cameras, make_fabric, make_task, open_cache, update_average
-from gknet.training.validation import usable_rows, validation_rows
+from gknet.training.run_file import TrainingRun
+from gknet.training.schedule import Budget, Stage, learning_rate, stage_at
+from gknet.training.settings import TrainSettings
+from gknet.training.setup import check_cameras, make_fabric, make_network, make_task, open_cache
+from gknet.training.tasks import Task
+from gknet.training.validation import InterruptibleFrames, usable_rows, validation_rows
 
 REPORT_STEPS = 50
 CHECKPOINT_S = 120.0
+
+
+@dataclass(eq=False)
+class Trainer:
+    """A training run that is ready to go, or to go on: `run()` takes steps until the budget is spent.
+
+    With a budget in samples every state is a function of the settings and the data alone, however often the run was
+    stopped on its way there: the batch of a step and its learning rate follow from the samples seen, and a run stops
+    between steps only. With a budget in minutes they follow from the clock.
+
+    Attributes:
+        out: Folder of run.json, metrics.csv, tensorboard/, checkpoint.pt and best.safetensors.
+        settings: Of the run.
+        record: The content of run.json.
+        identity: What a checkpoint in `out` must agree with.
+        fabric: The devices.
+        task: Draws samples, computes the loss, validates.
+        learner: The network and its optimizer.
+        loader: Of the training data.
+        frames: The val split, of which `rows` are used.
+        rows: Of `frames`.
+        budget: In samples or minutes.
+        state: How far it is.
+        logger: Of metrics.
+        on_step: Called after each step with the samples seen so far.
+    """
+
+    out: Path
+    settings: TrainSettings
+    record: TrainingRun
+    identity: dict[str, str]
+    fabric: Fabric
+    task: Task
+    learner: Learner
+    loader: Loader
+    frames: Sequence[Frame]
+    rows: Sequence[int]
+    budget: Budget
+    state: TrainingState
+    logger: MetricLogger
+    on_step: Callable[[int], None] = lambda samples: None
+
+    def __post_init__(self) -> None:
+        self._interruption = Interruption()
+        self._started = self._reported_s = 0.0
+        self._reported_samples = 0
+
+    def run(self) -> TrainingState:
+        """Train until the budget is spent.
+
+        Returns:
+            The last state, which is also in the checkpoint.
+
+        Raises:
+            Interrupted: A stop signal came (see `gknet.io.interrupt`). The checkpoint is of the last whole step.
+            DivergedError: The loss is no number any more.
+        """
+        self._start_clocks()
+        saved = time.monotonic()
+        with self._interruption, self.logger, closing(self._batches()) as batches:
+            while (was_due := self.state.is_validation_due) or self.progress < 1:
+                if was_due:
+                    self.validate()
+                else:
+                    self.step(next(batches))
+                is_stopping = self._is_stopping()
+                if was_due or is_stopping or time.monotonic() - saved > CHECKPOINT_S:
+                    self.save()
+                    saved = time.monotonic()
+                if is_stopping:
+                    self._interruption.raise_if_requested()
+                    raise Interrupted  # another process of this run got the signal
+        return self.state
+
+    @property
+    def progress(self) -> float:
+        """0 at the start, 1 when the budget is spent."""
+        return self.budget.progress(self.state.samples, self.state.elapsed_s)
+
+    def step(self, batch: Batch) -> None:
+        """Learn from one batch; a validation that it makes due comes next."""
+        state, before = self.state, self.progress
+        rate = learning_rate(self.settings.learning_rate, before, self.settings.warm_up, self.settings.cycles)
+        loss = self.learner.step(batch, rate, state.steps).item()
+        state.samples, state.steps, state.elapsed_s = batch.position, state.steps + 1, self._elapsed_s()
+        state.learning_rate, state.input_size = rate, batch.image.shape[1]
+        state.losses.append(loss)
+        if not math.isfinite(loss):
+            raise DivergedError(f"train: the loss became {loss} after {state.steps} steps; lower --lr")
+        count = self.settings.validations
+        state.is_validation_due = math.floor(self.progress * count) > math.floor(before * count)
+        if not state.is_validation_due and state.steps % REPORT_STEPS == 0:
+            self._report({})
+        self.on_step(state.samples)
+
+    def validate(self) -> None:
+        """Validate the averaged weights and keep them if they are the best; one that is interrupted stays due."""
+        values: dict[str, float] = {}
+        try:
+            if self.fabric.is_global_zero:
+                values = self._validated()
+        except Interrupted:
+            return
+        finally:
+            self.fabric.barrier()
+        self.state.is_validation_due = False
+        self.state.elapsed_s = self._elapsed_s()
+        self._report(values)
+
+    def save(self) -> None:
+        """Write run.json and the checkpoint."""
+        if self.fabric.is_global_zero:
+            self.record.save(self.out)
+            save_checkpoint(self.out, self.state, self.learner, self.identity)
+
+    def _validated(self) -> dict[str, float]:
+        frames = InterruptibleFrames(self.frames, self._interruption)
+        found = self.task.validate(self.learner.average, self.fabric.device, frames, self.rows)
+        if self.state.best is None or found.score < self.state.best["score"]:
+            best = {"score": found.score, "samples": self.state.samples, **found.values}
+            self._keep(best)
+        return {f"val_{name}": value for name, value in found.values.items()}
+
+    def _keep(self, best: dict[str, float]) -> None:
+        record = replace(self.record, best=best)
+        metadata = {name: getattr(record, name) for name in ("network", "graph", "loss", "best")}
+        save_weights(self.out / BEST, self.learner.average.state_dict(), metadata)
+        self.state.best, self.record = best, record
+
+    def _report(self, values: dict[str, float]) -> None:
+        """A row of metrics: the mean over the steps since the last one, and the values of a validation."""
+        state, seconds = self.state, max(1e-9, time.monotonic() - self._reported_s)
+        row = {
+            "progress": self.progress,
+            "elapsed_s": state.elapsed_s,
+            "samples": float(state.samples),
+            "input_size": float(state.input_size),
+            "learning_rate": state.learning_rate,
+            "loss": sum(state.losses) / len(state.losses),
+            "images_per_s": (state.samples - self._reported_samples) / seconds,
+        }
+        self.logger.log(row | values, state.elapsed_s / max(self.progress, 1e-9) * (1 - self.progress))
+        state.losses.clear()
+        self._reported_samples, self._reported_s = state.samples, time.monotonic()
+
+    def _start_clocks(self) -> None:
+        self._started = time.monotonic() - self.state.elapsed_s
+        self._reported_samples, self._reported_s = self.state.samples, time.monotonic()
+
+    def _batches(self) -> Generator[Batch, None, None]:
+        return self.loader.batches(self.state.samples, self._stage)
+
+    def _stage(self, samples: int) -> Stage:
+        return stage_at(self.settings.input_stages, self.budget.progress(samples, self._elapsed_s()))
+
+    def _elapsed_s(self) -> float:
+        return time.monotonic() - self._started
+
+    def _is_stopping(self) -> bool:
+        """Whether any process of this run got a stop signal: all of them stop after the same step."""
+        is_requested = self._interruption.requested
+        if self.fabric.world_size == 1:
+            return is_requested
+        requests = self.fabric.all_reduce(torch.tensor(float(is_requested)), reduce_op="sum")
+        return bool(cast(torch.Tensor, requests) > 0)
 
 
 def train(
@@ -51,128 +221,102 @@ def train(
     quiet: bool = False,
     on_step: Callable[[int], None] = lambda samples: None,
 ) -> TrainingState:
-    """Train on the train split of the SKD folder `data`, validate on the val split of the folder `val`.
+    """Train on the train split of an SKD folder, and validate on the val split.
 
-    val           `data` when None; crops to train on and whole frames to validate on are folders of their own
-    out           gets run.json, metrics.csv, tensorboard/, checkpoint.pt and best.safetensors (averaged weights)
-    resume        go on from out/checkpoint.pt; a larger budget prolongs the run
-    cache_folder  of the decoded crops; data/cache when None
-    on_step       called after each step with the samples seen so far
+    Args:
+        data: The SKD folder.
+        spacecraft_name: Which spacecraft of it.
+        out: Folder that gets run.json, metrics.csv, tensorboard/, checkpoint.pt and best.safetensors.
+        settings: Of the run.
+        resume: Go on from out/checkpoint.pt. A larger budget prolongs the run; see `gknet.training.settings.MAY_CHANGE`
+            for what else may differ.
+        cache_folder: Of the decoded crops; data/cache when None.
+        val: The SKD folder to validate on; `data` when None.
+        quiet: Nothing on standard output.
+        on_step: Called after each step with the samples seen so far.
+
+    Returns:
+        The state at the end.
+
+    Raises:
+        GknetError: Something in the arguments or the data is wrong, or another training writes to `out`.
+        Interrupted: A stop signal came; see `Trainer.run`.
     """
     cv2.setNumThreads(1)
-    if not resume and (out / CHECKPOINT).exists():
-        raise GknetError(f"{out}: it holds a training already; --resume goes on with it, or choose another folder")
-    training_data = SkdDataset(data, "train", spacecraft_name)
-    val_data = SkdDataset(val or data, "val", spacecraft_name)
+    training_data, val_data = (
+        SkdDataset(data, "train", spacecraft_name),
+        SkdDataset(val or data, "val", spacecraft_name),
+    )
     spacecraft = training_data.spacecraft
-    fabric = make_fabric(settings)
-    torch.manual_seed(settings.seed)
-    network = build(settings.network, spacecraft.adjacency, spacecraft.points_m, settings.graph, settings.chosen_loss)
-    if settings.init is not None and not resume:
-        taken, total = warm_start(network, settings.init)
-        fabric.print(f"{settings.init}: {taken} of {total} tensors taken")
-    check_cameras(network, training_data)
-    rows = usable_rows(val_data, validation_rows(len(val_data), settings.val_frames), spacecraft, fabric.print)
-    with fabric.rank_zero_first():
-        cache = open_cache(training_data, settings, cache_folder or data / "cache", fabric.print)
+    with run_folder(out):
+        if not resume and (out / CHECKPOINT).exists():
+            raise GknetError(f"{out}: it holds a training already; --resume goes on with it, or choose another folder")
+        fabric = make_fabric(settings)
+        network = make_network(spacecraft, settings, is_fresh=not resume)
+        check_cameras(network, training_data)
+        rows = usable_rows(val_data, validation_rows(len(val_data), settings.val_frames), spacecraft)
+        with fabric.rank_zero_first():
+            cache = open_cache(training_data, settings, cache_folder or data / "cache")
+        task = make_task(network, spacecraft, settings)
+        learner = Learner(network, task, settings, fabric)
+        identity = identity_of(spacecraft, settings)
+        state = load_checkpoint(out, learner, identity) if resume else TrainingState()
+        loader = Loader(cache, task.draw, settings.seed, fabric.global_rank, fabric.world_size)
+        budget = Budget.of(settings.samples, settings.epochs, settings.minutes, len(cache))
+        record = record_of(spacecraft, settings, data, state.best)
+        logger = MetricLogger(out, state.history, fabric.is_global_zero and not quiet, fabric.is_global_zero)
+        return Trainer(
+            out,
+            settings,
+            record,
+            identity,
+            fabric,
+            task,
+            learner,
+            loader,
+            val_data,
+            rows,
+            budget,
+            state,
+            logger,
+            on_step,
+        ).run()
 
-    task = make_task(network, spacecraft, settings)
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    average = copy.deepcopy(network).to(fabric.device).eval()
-    model, optimizer = fabric.setup(network, make_optimizer(network, settings))
-    if not isinstance(network, Locator):
-        model.mark_forward_method("branches")
 
-    kind = f"{settings.network} ({settings.graph}, {settings.chosen_loss})"
-    identity = f"{kind}, {spacecraft.name} with {spacecraft.keypoint_count} keypoints, seed {settings.seed}"
-    state = load_checkpoint(out, network, average, optimizer, identity) if resume else TrainingState()
-    toml = spacecraft_toml(replace(spacecraft, mesh_path=None))
-    run = TrainingRun(
+@contextmanager
+def run_folder(out: Path) -> Iterator[None]:
+    """The folder `out`, made and locked for one training; one that is still empty at the end is removed."""
+    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]
+        yield
+        return
+    is_new = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        try:
+            yield
+        finally:
+            if is_new and [path.name for path in out.iterdir()] == [LOCK_NAME]:
+                (out / LOCK_NAME).unlink()
+                out.rmdir()
+
+
+def identity_of(spacecraft: Spacecraft, settings: TrainSettings) -> dict[str, str]:
+    """What a resumed run must have in common with the run that it goes on with."""
+    return {"spacecraft": f"{spacecraft.name} with {spacecraft.keypoint_count} keypoints", **settings.fixed}
+
+
+def record_of(
+    spacecraft: Spacecraft, settings: TrainSettings, data: Path, best: dict[str, float] | None
+) -> TrainingRun:
+    """The run as run.json has it."""
+    return TrainingRun(
         settings.network,
         settings.graph,
         settings.chosen_loss,
         settings.input_size,
-        toml,
+        spacecraft_toml(replace(spacecraft, mesh_path=None)),
         asdict(settings),
         __version__,
         str(data),
-        state.best,
+        best,
     )
-    budget = Budget(settings.minutes, None if settings.epochs is None else round(settings.epochs * len(cache)))
-    out.mkdir(parents=True, exist_ok=True)
-    stages = settings.input_stages
-    started = time.monotonic() - state.elapsed_s
-    loader = Loader(cache, task.draw, settings.seed, fabric.global_rank, fabric.world_size)
-    batches = loader.batches(
-        state.samples, lambda place: stage_at(stages, budget.progress(place, time.monotonic() - started))
-    )
-
-    def save() -> None:
-        if fabric.is_global_zero:
-            run.save(out)
-            save_checkpoint(out, state, network, average, optimizer, identity)
-
-    def validate() -> dict[str, float]:
-        """Look at the averaged weights, keep them if they are the best."""
-        nonlocal run
-        if not fabric.is_global_zero:
-            return {}
-        found = task.validate(average, fabric.device, val_data, rows)
-        if state.best is None or found.score < state.best["score"]:
-            state.best = {"score": found.score, "samples": state.samples, **found.values}
-            run = replace(run, best=state.best)
-            save_weights(
-                out / BEST, average.state_dict(), {"network": run.network, "graph": run.graph, "loss": run.loss}
-            )
-        return {f"val_{name}": value for name, value in found.values.items()}
-
-    with MetricLogger(out, state.history, quiet or not fabric.is_global_zero) as logger, closing(batches):
-        progress = budget.progress(state.samples, state.elapsed_s)
-        reported, saved = (state.samples, time.monotonic()), time.monotonic()
-        losses: list[float] = []
-        try:
-            while progress < 1:
-                batch = next(batches)
-                rate = learning_rate(settings.learning_rate, progress, settings.warm_up, settings.cycles)
-                for group in optimizer.param_groups:
-                    group["lr"] = rate
-                model.train()
-                with fabric.autocast():  # Fabric itself casts in forward() alone, not in the other methods
-                    loss = task.loss(model, batch, fabric.device)
-                optimizer.zero_grad()
-                fabric.backward(loss)
-                fabric.clip_gradients(model, optimizer, max_norm=settings.clip, error_if_nonfinite=False)
-                optimizer.step()
-                update_average(average, network, min(settings.ema, (1 + state.steps) / (10 + state.steps)))
-
-                before, now = progress, time.monotonic()
-                state.samples, state.steps, state.elapsed_s = batch.position, state.steps + 1, now - started
-                progress = budget.progress(state.samples, state.elapsed_s)
-                losses.append(loss.item())
-                if not math.isfinite(losses[-1]):
-                    raise DivergedError(f"train: the loss became {losses[-1]} after {state.steps} steps; lower --lr")
-                validating = math.floor(progress * settings.validations) > math.floor(before * settings.validations)
-                if validating or state.steps % REPORT_STEPS == 0:
-                    row = {
-                        "progress": progress,
-                        "elapsed_s": state.elapsed_s,
-                        "samples": float(state.samples),
-                        "input_size": float(batch.image.shape[1]),
-                        "learning_rate": rate,
-                        "loss": sum(losses) / len(losses),
-                        "images_per_s": (state.samples - reported[0]) / max(1e-9, now - reported[1]),
-                    }
-                    if validating:
-                        row |= validate()
-                        fabric.barrier()
-                        state.elapsed_s = time.monotonic() - started
-                    logger.log(row, state.elapsed_s / max(progress, 1e-9) * (1 - progress))
-                    reported, losses = (state.samples, time.monotonic()), []
-                on_step(state.samples)
-                if validating or time.monotonic() - saved > CHECKPOINT_S:
-                    save()
-                    saved = time.monotonic()
-        except KeyboardInterrupt:
-            save()
-            raise
-    return state

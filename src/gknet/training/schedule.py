@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gknet.errors import GknetError
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stretch of the training: its share of the budget, the input's side in pixels and the batch."""
-
-    share: float
-    input_size: int
-    batch: int
-
-    def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise GknetError(f"stage: expected a share in (0, 1], got {self.share}")
-        if self.input_size < 32 or self.input_size % 32:
-            raise GknetError(f"stage: expected an input size that is a multiple of 32, got {self.input_size}")
-        if self.batch < 1:
-            raise GknetError(f"stage: expected a batch of at least 1, got {self.batch}")
+from gknet.network.spec import Stage
 
 
 def parse_stages(text: str) -> tuple[Stage, ...]:
-    """Stages from '0.4:128:64,0.6:256:32', each share:input_size:batch."""
+    """Stages from text such as '0.4:128:64,0.6:256:32', each share:input_size:batch.
+
+    Raises:
+        GknetError: The text is of another form, or the shares do not sum to 1.
+    """
     stages = []
     for part in text.split(","):
         try:
@@ -40,7 +29,13 @@ def parse_stages(text: str) -> tuple[Stage, ...]:
     return tuple(stages)
 
 
+def stages_text(stages: Sequence[Stage]) -> str:
+    """The text that `parse_stages` reads."""
+    return ",".join(f"{stage.share:g}:{stage.input_size}:{stage.batch}" for stage in stages)
+
+
 def stage_at(stages: tuple[Stage, ...], progress: float) -> Stage:
+    """The stage at a progress from 0 to 1."""
     end = 0.0
     for stage in stages:
         end += stage.share
@@ -64,16 +59,26 @@ def learning_rate(peak: float, progress: float, warm_up: float, cycles: int = 1)
 
 @dataclass(frozen=True)
 class Budget:
-    """How long to train: by the clock or by the samples seen; exactly one of the two."""
+    """How long to train.
+
+    Attributes:
+        minutes: By the clock; or
+        samples: pictures seen. Exactly one of the two.
+    """
 
     minutes: float | None = None
     samples: int | None = None
 
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.samples is None):
-            raise GknetError("budget: give either minutes or epochs")
+            raise GknetError("budget: expected either minutes or samples")
         if (self.minutes if self.minutes is not None else self.samples or 0) <= 0:
             raise GknetError(f"budget: expected a positive length, got {self.minutes or self.samples}")
+
+    @classmethod
+    def of(cls, samples: int | None, epochs: float | None, minutes: float | None, count: int) -> Budget:
+        """The budget of the settings, with `count` samples to an epoch."""
+        return cls(minutes, max(1, round(epochs * count)) if epochs is not None else samples)
 
     def progress(self, samples: int, elapsed_s: float) -> float:
         """0 at the start, 1 when the budget is spent."""

@@ -1,58 +1,86 @@
-"""What a training run is made of, and the run.json that remembers it."""
+"""What a training run is made of. It loads no library: the command line reads its options from here."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, fields
+import math
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import Field, TypeAdapter, ValidationError
+from typing import TYPE_CHECKING
 
 from gknet.errors import GknetError
-from gknet.io.atomic import write_text
-from gknet.network.build import GRAPH_NETWORKS, NETWORKS, OWN_LOSS_NETWORKS, default_loss
-from gknet.network.spec import checked_graph, checked_loss
-from gknet.training.cache import Window
-from gknet.training.schedule import Stage
+from gknet.network.build import NETWORKS, spec_of
+from gknet.network.spec import Stage, checked_graph, checked_loss
+from gknet.training.schedule import stages_text
+
+if TYPE_CHECKING:
+    from gknet.training.cache import Window
 
 OPTIMIZERS = ("muon", "adamw")
-PAPER_STAGES = (Stage(1.0, 256, 16),)
-STAGES = {
-    "gknet-s": (Stage(0.4, 128, 32), Stage(0.3, 192, 32), Stage(0.3, 256, 32)),
-    "gknet-paper": PAPER_STAGES,
-    "hrnet": PAPER_STAGES,
-    "resunet": PAPER_STAGES,
-    "dmanet": PAPER_STAGES,
-    "locator": (Stage(0.4, 128, 32), Stage(0.6, 256, 32)),
+DEVICES = ("auto", "cpu", "cuda", "mps")
+PRECISIONS = ("auto", "32-true", "bf16-mixed", "16-mixed")
+BUDGETS = ("samples", "epochs", "minutes")
+
+MAY_CHANGE = (*BUDGETS, "validations", "device", "devices", "precision", "workers", "init")
+"""Settings that `--resume` may give anew. Every other one shapes the weights or what they are judged by, and stays."""
+
+BOUNDS: dict[str, tuple[float, float]] = {
+    "samples": (1, 1e12),
+    "epochs": (1e-6, 1e6),
+    "minutes": (1e-6, 1e6),
+    "learning_rate": (1e-12, 10),
+    "weight_decay": (0, 10),
+    "warm_up": (0, 0.99),
+    "cycles": (1, 10_000),
+    "auxiliary": (0, 100),
+    "ema": (0, 0.999999),
+    "clip": (1e-6, 1e6),
+    "seed": (0, 2**32 - 1),
+    "devices": (1, 1024),
+    "workers": (1, 256),
+    "val_frames": (1, 1e9),
+    "validations": (1, 1e6),
+    "cache_size": (32, 4096),
 }
-"""Small pictures first: most of what there is to learn is seen there, at a quarter of the cost."""
+"""The smallest and the largest value of each setting that is a number; NaN lies in none."""
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """One training run.
+    """One training run. Exactly one of `samples`, `epochs` and `minutes` is the budget.
 
-    loss              "likelihood" or "squared"; None takes the network's own
-    minutes, epochs   the budget: exactly one of them
-    stages            None takes the network's own (STAGES)
-    optimizer         "muon" (and AdamW for what it is not for) or "adamw"
-    warm_up           share of the budget in which the learning rate rises
-    cycles            of the cosine; more than one are warm restarts
-    ema               how much of the averaged weights stays at each step
-    auxiliary         weight of the loss on each branch's own maps
-    clip              largest norm of the gradient
-    val_frames        frames of the val split, evenly spread
-    validations       how often they are looked at
-    cache_size        side of the cached crops in pixels
-    init              .safetensors to start from; tensors that do not fit stay fresh
+    Attributes:
+        network: gknet-s, gknet-xs, hrnet-xs, resunet-xs, dmanet-xs, gknet-paper, hrnet, resunet, dmanet or locator.
+        graph: skeleton, identity (no edges), random (as many) or none (no graph branch).
+        loss: likelihood or squared; left out, the network's own.
+        samples: Budget in pictures seen, by all devices together.
+        epochs: Budget in passes over the data.
+        minutes: Budget by the clock, for convenience: such a run cannot be repeated exactly.
+        stages: share:input_size:batch,... such as 0.4:128:32,0.6:256:32; left out, the network's own.
+        optimizer: muon (AdamW takes the parameters that Muon is not for), or adamw at about half the learning rate.
+        learning_rate: At its peak.
+        weight_decay: Of matrices and kernels, decoupled.
+        warm_up: Share of the budget in which the learning rate rises.
+        cycles: Of the cosine that the learning rate follows; more than one are warm restarts.
+        auxiliary: Weight of the loss on the maps of each branch.
+        ema: How much of the averaged weights stays at each step.
+        clip: Largest norm of the gradient.
+        seed: Of weights, order and augmentation.
+        device: auto, cpu, cuda or mps.
+        devices: How many; more than one train with DDP.
+        precision: auto, 32-true, bf16-mixed or 16-mixed.
+        workers: Threads that decode pictures for the cache.
+        val_frames: Frames of the val split to validate on, evenly spread.
+        validations: How many there are over the budget.
+        cache_size: Side of the cached crops in pixels.
+        init: A .safetensors file to start from, of any spacecraft; tensors that do not fit stay fresh.
     """
 
     network: str = "gknet-s"
     graph: str = "skeleton"
     loss: str | None = None
-    minutes: float | None = None
+    samples: int | None = None
     epochs: float | None = None
+    minutes: float | None = None
     stages: tuple[Stage, ...] | None = None
     optimizer: str = "muon"
     learning_rate: float = 4e-3
@@ -73,29 +101,34 @@ class TrainSettings:
     init: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.network not in NETWORKS:
-            raise GknetError(f"network: expected one of {', '.join(NETWORKS)}, got '{self.network}'")
-        if checked_graph(self.graph) != "skeleton" and self.network not in GRAPH_NETWORKS:
-            raise GknetError(f"graph: {self.network} has none to choose; only {', '.join(GRAPH_NETWORKS)} have")
-        if self.loss is not None and checked_loss(self.loss) and self.network in OWN_LOSS_NETWORKS:
+        for name, choices in (("optimizer", OPTIMIZERS), ("device", DEVICES), ("precision", PRECISIONS)):
+            if getattr(self, name) not in choices:
+                raise GknetError(f"{name}: expected one of {', '.join(choices)}, got '{getattr(self, name)}'")
+        if sum(getattr(self, name) is not None for name in BUDGETS) != 1:
+            raise GknetError("train: expected exactly one budget: --samples, --epochs or --minutes")
+        for name, (low, high) in BOUNDS.items():
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
+                raise GknetError(f"{name}: expected a number from {low:g} to {high:g}, got {value:g}")
+        self._check_network()
+
+    def _check_network(self) -> None:
+        spec = spec_of(self.network)
+        if checked_graph(self.graph) != "skeleton" and not spec.has_graph:
+            have = ", ".join(name for name, other in NETWORKS.items() if other.has_graph)
+            raise GknetError(f"graph: {self.network} has none to choose; only {have} have")
+        if self.loss is not None and checked_loss(self.loss) and spec.loss is None:
             raise GknetError(f"loss: {self.network} has its own; leave it out")
-        if self.optimizer not in OPTIMIZERS:
-            raise GknetError(f"optimizer: expected one of {', '.join(OPTIMIZERS)}, got '{self.optimizer}'")
-        if (self.minutes is None) == (self.epochs is None):
-            raise GknetError("train: give either --minutes or --epochs")
-        for name in ("learning_rate", "cycles", "clip", "devices", "val_frames", "validations", "cache_size"):
-            if not getattr(self, name) > 0:  # nan is not
-                raise GknetError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        if not 0 <= self.ema < 1 or not 0 <= self.warm_up < 1:
-            raise GknetError(f"ema and warm_up: expected values in [0, 1), got {self.ema} and {self.warm_up}")
 
     @property
     def chosen_loss(self) -> str:
-        return default_loss(self.network) if self.loss is None else self.loss
+        """The loss of the settings, or else the network's own; "likelihood" where there is nothing to choose."""
+        return self.loss or spec_of(self.network).loss or "likelihood"
 
     @property
     def input_stages(self) -> tuple[Stage, ...]:
-        return self.stages or STAGES.get(self.network, STAGES["gknet-s"])
+        """The stages of the settings, or else the network's own."""
+        return self.stages or spec_of(self.network).stages
 
     @property
     def input_size(self) -> int:
@@ -104,48 +137,11 @@ class TrainSettings:
 
     @property
     def window(self) -> Window:
-        """What of a frame the network sees."""
-        return "picture" if self.network == "locator" else "craft"
+        """The part of a frame that is the network's input."""
+        return "picture" if spec_of(self.network).kind == "locator" else "craft"
 
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """run.json: what `gknet export` and a resumed run need to know.
-
-    spacecraft_toml  the text of the spacecraft's file
-    data             the folder it was trained on
-    best             the best validation so far, None before the first
-    """
-
-    network: str
-    graph: str
-    loss: str
-    input_size: Annotated[int, Field(gt=0, multiple_of=32)]
-    spacecraft_toml: str
-    settings: dict[str, object]
-    version: str
-    data: str
-    best: dict[str, float] | None
-
-    def save(self, folder: Path) -> None:
-        write_text(folder / "run.json", json.dumps(asdict(self), indent=1, default=str) + "\n")
-
-
-def load_run(folder: Path) -> TrainingRun:
-    path = folder / "run.json"
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise GknetError(
-            f"{path}: cannot read the run ({error.strerror}); expected a folder of 'gknet train'"
-        ) from error
-    except ValueError as error:
-        raise GknetError(f"{path}: not valid JSON: {error}") from error
-    names = {field.name for field in fields(TrainingRun)}
-    if not isinstance(values, dict) or set(values) != names:
-        raise GknetError(f"{path}: expected the keys {', '.join(sorted(names))}")
-    try:
-        return TypeAdapter(TrainingRun).validate_python(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise GknetError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    @property
+    def fixed(self) -> dict[str, str]:
+        """Each setting that a resumed run must have as it was, as text, defaults filled in."""
+        texts = {field.name: str(getattr(self, field.name)) for field in fields(self) if field.name not in MAY_CHANGE}
+        return texts | {"loss": self.chosen_loss, "stages": stages_text(self.input_stages)}

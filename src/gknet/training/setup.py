@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from lightning_fabric import Fabric
-from torch import nn
 
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop_pose import has_square_pixels
+from gknet.network.build import build
 from gknet.network.dmanet import DMANet
 from gknet.network.locator import Locator
 from gknet.network.network import Network
 from gknet.spacecraft import Spacecraft
 from gknet.training.cache import Cache, FrameSource, build_cache
+from gknet.training.checkpoint import warm_start
 from gknet.training.settings import TrainSettings
 from gknet.training.tasks import DirectTask, KeypointTask, LocatorTask, Task
-from gknet.training.validation import validation_rows
+
+logger = logging.getLogger(__name__)
 
 BF16_FLAGS = {"avx512_bf16", "amx_bf16"}
 PICTURE_SIZE = 256
 """Side of a cached whole picture: the locator's input."""
-STAMPED = 64
-"""So many image files, evenly spread, tell by size and time whether the pictures are still the same."""
 
 
 def cpu_has_bf16() -> bool:
@@ -39,14 +42,21 @@ def cpu_has_bf16() -> bool:
 
 
 def chosen_precision(settings: TrainSettings) -> str:
+    """The precision of the settings; for "auto" bfloat16 where the device multiplies it in hardware."""
     if settings.precision != "auto":
         return settings.precision
-    on_gpu = settings.device in ("cuda", "gpu") or (settings.device == "auto" and torch.cuda.is_available())
+    on_gpu = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
     has_bf16 = torch.cuda.is_bf16_supported() if on_gpu else cpu_has_bf16()
     return "bf16-mixed" if has_bf16 else "32-true"
 
 
 def make_fabric(settings: TrainSettings) -> Fabric:
+    """The devices of the settings.
+
+    Raises:
+        GknetError: This machine does not have them, or not in that precision.
+    """
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # no notes about the precision that was chosen
     try:
         fabric = Fabric(
             accelerator=settings.device,
@@ -55,14 +65,25 @@ def make_fabric(settings: TrainSettings) -> Fabric:
             precision=chosen_precision(settings),  # type: ignore[arg-type]
         )
         fabric.launch()
-    except (ValueError, RuntimeError) as error:  # a device or a precision that is not there
+    except (ValueError, RuntimeError, ImportError) as error:  # a device or a precision that is not there
         raise GknetError(f"train: {str(error).splitlines()[0]}") from error
     if fabric.world_size > 1 and settings.minutes is not None:
-        raise GknetError("train: several devices cannot agree on a clock; give --epochs instead of --minutes")
+        raise GknetError("train: several devices cannot agree on a clock; give --samples instead of --minutes")
     return fabric
 
 
+def make_network(spacecraft: Spacecraft, settings: TrainSettings, is_fresh: bool) -> Network:
+    """The network of the settings; a fresh one begins with the weights of `settings.init`."""
+    torch.manual_seed(settings.seed)
+    network = build(settings.network, spacecraft.adjacency, spacecraft.points_m, settings.graph, settings.chosen_loss)
+    if settings.init is not None and is_fresh:
+        taken, total = warm_start(network, settings.init)
+        logger.info("%s: %d of %d tensors taken", settings.init, taken, total)
+    return network
+
+
 def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings) -> Task:
+    """What the network is trained for."""
     if isinstance(network, Locator):
         return LocatorTask(spacecraft, network.stride, settings.input_size)
     if isinstance(network, DMANet):
@@ -72,7 +93,7 @@ def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings)
 
 
 def check_cameras(network: Network, frames: FrameSource) -> None:
-    """Refuse pixels that are not square to a direct network: turned, their picture is of no rolled camera."""
+    """Refuse pixels that are not square to a direct network: a rotated picture of them is that of no camera."""
     if not isinstance(network, DMANet):
         return
     for i in range(len(frames)):
@@ -87,42 +108,50 @@ def check_cameras(network: Network, frames: FrameSource) -> None:
             )
 
 
-@torch.no_grad()
-def update_average(average: nn.Module, network: nn.Module, keep: float) -> None:
-    """average <- keep * average + (1 - keep) * network, statistics of the normalisation included."""
-    pairs = list(zip(average.state_dict().values(), network.state_dict().values(), strict=True))
-    floats = [(a, n) for a, n in pairs if a.is_floating_point()]
-    torch._foreach_lerp_([a for a, _ in floats], [n for _, n in floats], 1 - keep)
-    for a, n in pairs:
-        if not a.is_floating_point():
-            a.copy_(n)
+def open_cache(
+    data: SkdDataset, settings: TrainSettings, folder: Path, report: Callable[[str], None] = logger.warning
+) -> Cache:
+    """The decoded crops of a dataset, built under `folder` if they are not there.
 
-
-def _stamp(data: SkdDataset, row: int) -> str:
-    """Size and time of a frame's picture; nothing where its label or its picture is missing."""
-    try:
-        file = data.extras(row).image_path.stat()
-    except (GknetError, OSError):
-        return ""
-    return f"{file.st_size}:{file.st_mtime_ns}"
-
-
-def open_cache(data: SkdDataset, settings: TrainSettings, folder: Path, say: Callable[[str], None]) -> Cache:
-    """The decoded crops of `data`, built under `folder` if they are not there."""
+    Args:
+        data: The dataset.
+        settings: Of the run: window, size and workers.
+        folder: Of caches. The dataset has one place there for each window and size.
+        report: Called with a line for each frame that is left out.
+    """
     from gknet.io.progress import progress
 
-    stamp = " ".join(_stamp(data, row) for row in validation_rows(len(data), STAMPED))
     size = PICTURE_SIZE if settings.window == "picture" else settings.cache_size
     with progress() as bar:
         task = bar.add_task("decoding", total=len(data))
         return build_cache(
             data,
             data.spacecraft,
-            folder,
+            folder / _cache_name(data, folder, f"{settings.window}_{size}"),
             size,
             settings.window,
-            stamp,
+            picture_stamp(data),
             settings.workers,
             lambda done, total: bar.update(task, completed=done),
-            say,
+            report,
         )
+
+
+def _cache_name(data: SkdDataset, folder: Path, kind: str) -> str:
+    """A name in `folder` for the cache of a dataset, which stays when the dataset's content changes."""
+    root = os.path.relpath(data.root.resolve(), folder.resolve())  # both may move together
+    digest = hashlib.sha256(os.fsencode(f"{root} {data.spacecraft.name}")).hexdigest()
+    return f"{kind}_{digest[:12]}"
+
+
+def picture_stamp(data: SkdDataset) -> str:
+    """Sizes and times of all picture files in one digest, which changes with any of them."""
+    digest = hashlib.sha256()
+    for row in range(len(data)):
+        try:
+            file = data.extras(row).image_path.stat()
+        except (GknetError, OSError):  # no label or no picture: the cache leaves the frame out
+            digest.update(b"-")
+        else:
+            digest.update(f"{file.st_size}:{file.st_mtime_ns};".encode())
+    return digest.hexdigest()

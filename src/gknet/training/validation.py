@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import numpy as np
 import torch
@@ -21,16 +23,43 @@ from gknet.inference.decode import Decoding
 from gknet.inference.direct_estimator import DirectEstimator
 from gknet.inference.keypoint_estimator import KeypointEstimator
 from gknet.inference.network_io import NetworkOutput
+from gknet.io.interrupt import Interruption
 from gknet.network.heatmap import HeatmapNetwork
 from gknet.spacecraft import Spacecraft
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Validation:
-    """`score` decides which weights are the best: lower is better. `values` are what the tables show."""
+    """The result of a validation.
+
+    Attributes:
+        score: Decides which weights are the best: lower is better.
+        values: What the tables show.
+    """
 
     score: float
     values: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class InterruptibleFrames(Sequence[Frame]):
+    """Frames of which the next one is not read once a stop signal came: `Interrupted` is raised instead."""
+
+    frames: Sequence[Frame]
+    interruption: Interruption
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @overload
+    def __getitem__(self, i: int) -> Frame: ...
+    @overload
+    def __getitem__(self, i: slice) -> Sequence[Frame]: ...
+    def __getitem__(self, i: int | slice) -> Frame | Sequence[Frame]:
+        self.interruption.raise_if_requested()
+        return self.frames[i]
 
 
 def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray], ndarray]:
@@ -44,17 +73,15 @@ def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray
     return run
 
 
-def _usable(
-    frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft, report: Callable[[str], None]
-) -> Iterator[tuple[int, Frame]]:
-    """The rows and frames that can be read and that show the craft, one at a time; the others are reported."""
+def _usable(frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft) -> Iterator[tuple[int, Frame]]:
+    """The rows and frames that can be read and that show the craft, one at a time; the others are logged."""
     found = 0
     for row in rows:
         try:
             frame = frames[row]
             metrics.oracle_crop(frame, spacecraft)
         except GknetError as error:
-            report(f"left out: {error}")
+            logger.warning("left out: %s", error)
             continue
         found += 1
         yield row, frame
@@ -62,11 +89,13 @@ def _usable(
         raise GknetError("validation: no frame of the val split can be read and shows the spacecraft")
 
 
-def usable_rows(
-    frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft, report: Callable[[str], None]
-) -> list[int]:
-    """The rows that a validation can use, looked at before the training begins."""
-    return [row for row, _ in _usable(frames, rows, spacecraft, report)]
+def usable_rows(frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft) -> list[int]:
+    """The rows that a validation can use, found before the training begins; the others are logged.
+
+    Raises:
+        GknetError: There are none.
+    """
+    return [row for row, _ in _usable(frames, rows, spacecraft)]
 
 
 def validation_rows(count: int, wanted: int) -> list[int]:
@@ -86,14 +115,14 @@ def validate_keypoints(
     network.eval()
     settings = InferenceSettings(input_size=input_size)
     run = numpy_network(network, device)
-    bare = KeypointEstimator(
+    uncalibrated = KeypointEstimator(
         lambda images: NetworkOutput(run(images)), spacecraft, settings=settings, decoding=UNCALIBRATED
     )
-    samples = [collect_sample(frame, bare, network.stride) for _, frame in _usable(frames, rows, spacecraft, print)]
+    samples = [collect_sample(frame, uncalibrated, network.stride) for _, frame in _usable(frames, rows, spacecraft)]
     try:
-        estimator = calibrated(bare, samples)
-    except GknetError:  # nothing was sure enough yet
-        estimator = replace(bare, decoding=Decoding())
+        estimator = calibrated(uncalibrated, samples)
+    except GknetError:  # too few confident keypoints yet
+        estimator = replace(uncalibrated, decoding=Decoding())
     errors = [metrics.compute_errors(s.frame, s.estimate(estimator), spacecraft) for s in samples]
     values = _means(errors) | {
         "floor_cells": estimator.decoding.floor_cells,
@@ -128,7 +157,7 @@ def validate_direct(
     settings = InferenceSettings(input_size=input_size)
     estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, settings=settings)
     errors = []
-    for _, frame in _usable(frames, rows, spacecraft, print):
+    for _, frame in _usable(frames, rows, spacecraft):
         assert frame.image is not None
         estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(spacecraft.points_m))
         errors.append(metrics.compute_errors(frame, estimate, spacecraft))
@@ -154,7 +183,7 @@ def validate_locator(
         settings=InferenceSettings(locator_size=input_size),
     )
     overlaps = []
-    for _, frame in _usable(frames, rows, spacecraft, print):
+    for _, frame in _usable(frames, rows, spacecraft):
         assert frame.image is not None
         true_box, found = frame.true_box(spacecraft.points_m), estimator.locate(frame.image)
         overlaps.append(0.0 if found is None or true_box is None else found.iou(true_box))
