@@ -255,7 +255,7 @@ class GKNet(HeatmapNetwork):
         encoding = position_encoding(height, width, encoded.pyramid)  # (16, h/4, w/4)
         offset = self.pixel_position(encoding.flatten(1).T).T.reshape(-1, height, width)
         features = functional.relu(self.pixel_features(encoded.pyramid) + offset)
-        with_position = torch.cat([features, encoding.expand(len(features), -1, -1, -1)], dim=1)
+        with_position = torch.cat([features, encoding.expand(features.shape[0], -1, -1, -1)], dim=1)
         return GraphInput(memory, features, with_position.flatten(2).transpose(1, 2))
 
     def first_pass(self, encoded: Encoded, given: GraphInput) -> FirstPass:
