@@ -447,9 +447,9 @@ def pipeline() -> Figure:
 def architecture() -> Figure:
     figure, axes = canvas(10.4, 7.0)
     image_y, row1, row2, row3 = 6.45, 5.4, 4.25, 2.9
-    for y0, y1, name in ((2.4, 3.52, "first_pass()"), (0.72, 1.88, "second_pass()")):
-        axes.add_patch(Rectangle((3.05, y0), 5.0, y1 - y0, fc="#f7f7fb", ec=BLUE, lw=1, ls="--"))
-        note(axes, 8.0, y1 - 0.09, name, ha="right", color=BLUE, fontsize=9.5, family="monospace")
+    for y0, y1, name in ((2.4, 3.55, "first_pass()"), (0.75, 1.88, "second_pass()")):
+        axes.add_patch(Rectangle((0.1, y0), 8.05, y1 - y0, fc="#f7f7fb", ec=BLUE, lw=1, ls="--"))
+        note(axes, 8.1, y1 - 0.1, name, ha="right", color=BLUE, fontsize=9.5, family="monospace")
     block(axes, 1.3, image_y, 1.7, 0.55, "image", "3 x 192 x 192")
     block(axes, 1.3, row1, 2.1, 0.85, "residual encoder", "32x48x48, 64x24x24,\n128x12x12, 256x6x6", PALE_BLUE)
     block(
@@ -511,15 +511,11 @@ def architecture() -> Figure:
     axes.plot([7.87, 9.1, 9.1], [row3, row3, row1], color=ORANGE, lw=1.3)
     arrow(axes, (9.1, row1), (8.68, row1), ORANGE)
     note(axes, 9.2, 3.9, "the first maps\n(pixel + node)\nupdate the\nattitude", color=ORANGE, fontsize=8.4, ha="left")
-    arrow(axes, (4.6, 2.49), (4.6, 1.66), INK)
-    note(
-        axes,
-        4.72,
-        2.12,
-        "sharpened probability of the first maps\n(in training: some keypoints teacher-forced)",
-        fontsize=8.4,
-        ha="left",
-    )
+    axes.plot([7.1, 7.1, 4.9], [2.49, 2.2, 2.2], color=INK, lw=1.3)
+    arrow(axes, (4.9, 2.2), (4.9, 1.66))
+    arrow(axes, (2.38, second), (3.32, second))
+    note(axes, 2.76, second + 0.13, "where", fontsize=8.4)
+    note(axes, 5.02, 2.04, "sum sharpened; some keypoints teacher-forced in training", fontsize=8.4, ha="left")
     arrow(axes, (1.3, 2.5), (1.3, 1.66))
     note(axes, 1.4, 2.08, "prior of the\nupdated attitude", fontsize=8.4, ha="left", color=GREEN)
     arrow(axes, (5.88, second), (6.32, second))
