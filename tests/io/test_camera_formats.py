@@ -230,7 +230,7 @@ def test_byte_order_marks_and_windows_lines(tmp_path: Path, text: str, end: str)
     [
         ("hello", "expected a camera file: gknet's JSON.*COLMAP"),
         ("", "expected a camera file"),
-        ("[1, 2]", "expected a camera file"),
+        ("[1, 2]", "expected a JSON object"),
         ('{"a": 1}', "missing height, matrix, width"),
         ('{"fx": 1}', "missing fy, cx, cy, width, height"),
         ('{"matrix": 1, "width": 5, "height": 5, "other": 1}', "unknown key other"),

@@ -239,20 +239,19 @@ def test_a_video_of_which_no_frame_decodes(tmp_path: Path) -> None:
         open_video(path)
 
 
-class FakeCapture(cv2.VideoCapture):
+class FakeCapture:
     """A camera that delivers `frames` pictures and then nothing; each third grab fails."""
 
     def __init__(self, frames: int) -> None:
-        super().__init__()
         self.left, self.grabs = frames, 0
 
     def isOpened(self) -> bool:
         return True
 
-    def set(self, propId: int, value: float) -> bool:
+    def set(self, key: int, value: float) -> bool:
         return True
 
-    def get(self, propId: int) -> float:
+    def get(self, key: int) -> float:
         return float("nan")
 
     def release(self) -> None:
@@ -265,7 +264,7 @@ class FakeCapture(cv2.VideoCapture):
         self.left -= 1
         return True
 
-    def retrieve(self, *_: object) -> tuple[bool, np.ndarray]:  # type: ignore[override]
+    def retrieve(self, *_: object) -> tuple[bool, np.ndarray]:
         return True, grey(100)
 
 

@@ -78,6 +78,7 @@ def test_a_bad_frame_is_recorded_in_its_place(tmp_path: Path) -> None:
 
 
 def test_several_inputs_of_all_kinds(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
     for number in range(3):
         write_image(tmp_path / "in" / f"{number}.png", toy_picture(number))
     film(tmp_path / "in" / "b.mp4", 5, 6)

@@ -36,7 +36,7 @@ LIMIT_BYTES = 256 * 1024
 
 FORMATS = (
     "gknet's JSON, SPEED+'s or BOP's camera.json, OpenCV's YAML, XML or JSON, ROS's camera_info, Kalibr's camchain, "
-    "COLMAP's cameras.txt, or a 3x3 matrix as text"
+    "COLMAP's cameras.txt, or 3 rows of 3 numbers as text"
 )
 
 
@@ -55,7 +55,7 @@ def read_camera(path: str | Path) -> Camera | MatrixOnly:
     text = read_text(path, LIMIT_BYTES)
     lines = (line.strip() for line in text.splitlines())
     first = next((line for line in lines if line and not line.startswith(("#", "---"))), "")
-    if first.startswith(("{", "[{")):
+    if first.startswith(("{", "[")):
         return from_json(path, parse_json(text, path))
     if first.startswith("<"):
         return from_xml(path, text)
@@ -63,7 +63,7 @@ def read_camera(path: str | Path) -> Camera | MatrixOnly:
         return from_colmap(path, text)
     if first.startswith("%YAML") or re.match(r"[^\s:,]+:(\s|$)", first):
         return from_yaml(path, text)
-    if re.match(r"[-+.\d]", first):
+    if re.match(r"[-+.\d]|nan|inf", first, re.IGNORECASE):
         return _from_matrix_text(path, text)
     raise GknetError(f"{path}: expected a camera file: {FORMATS}")
 

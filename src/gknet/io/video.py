@@ -121,8 +121,8 @@ def _capture(source: Path | str | int) -> Iterator[cv2.VideoCapture]:
         yield capture
 
 
-def _retrieved(capture: cv2.VideoCapture) -> UInt8[ndarray, "h w 3"] | None:
-    """The frame that was grabbed, as RGB."""
+def _retrieved(capture: cv2.VideoCapture) -> ndarray | None:
+    """The frame that was grabbed as (h, w, 3) uint8 RGB; None where it cannot be decoded."""
     decoded, image = capture.retrieve()
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if decoded and image is not None and image.size else None
 

@@ -159,7 +159,8 @@ def _of_folder(root: str) -> list[Found]:
         folders[:] = sorted((name for name in folders if name not in own and name[0] != "."), key=natural_key)
         for file in files:
             path = os.path.join(folder, file)
-            if file not in own and file[0] != "." and _kind(file) is not None and os.path.isfile(path):
+            taken = file not in own and file[0] != "." and _kind(file) is not None
+            if taken and (os.path.isfile(path) or os.path.islink(path)):  # a broken link is a picture that is missing
                 found.append(_file(path, os.path.relpath(path, root).replace(os.sep, "/")))
     return sorted(found, key=lambda item: natural_key(os.path.relpath(item.path, root)))
 
@@ -193,15 +194,18 @@ def _with_own_names(found: list[Found]) -> list[Found]:
     """Names that can be printed and differ: where two are the same, with the folders above, else with a number."""
     named = [replace(item, name=printable(item.name)) for item in found]
     counts = Counter(item.name for item in named)
-    if max(counts.values(), default=0) > 1:
-        common = os.path.commonpath([os.path.abspath(item.path) for item in named])
-        named = [replace(item, name=_from(common, item)) if counts[item.name] > 1 else item for item in named]
+    files = [os.path.abspath(item.path) for item in named if item.kind is not Kind.LIVE]
+    common = os.path.commonpath(files) if files else ""
+    named = [_longer(item, common) if counts[item.name] > 1 else item for item in named]
     taken: set[str] = set()
     return [replace(item, name=_untaken(item.name, taken)) for item in named]
 
 
-def _from(folder: str, item: Found) -> str:
-    return printable(os.path.relpath(os.path.abspath(item.path), folder).replace(os.sep, "/"))
+def _longer(item: Found, folder: str) -> Found:
+    """With its folders below `folder` and its suffix in its name."""
+    if item.kind is Kind.LIVE:
+        return item
+    return replace(item, name=printable(os.path.relpath(os.path.abspath(item.path), folder).replace(os.sep, "/")))
 
 
 def _untaken(name: str, taken: set[str]) -> str:
