@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-from gknet.cli.demo import bundled_frames
+from gknet.dataset.demo_frames import bundled_frames
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError, ends_in_one_line
 from gknet.evaluation.metrics import compute_errors, oracle_crop

@@ -31,14 +31,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gknet.cli.evaluate import evaluate
-from gknet.dataset.skd import SkdDataset
+from gknet.dataset.skd import SkdDataset, open_dataset
 from gknet.errors import ends_in_one_line
 from gknet.fleet import NAMES
+from gknet.inference.load import load_estimator
 from gknet.network.build import build
 from gknet.render.generate import generate
 from gknet.render.options import Options, Selection
 from gknet.render.recipe import RECIPES
+from gknet.report.write import evaluate_section, write_report
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights, save_weights
 from gknet.training.export import export_run
 from gknet.training.loop import train
@@ -265,7 +266,11 @@ def judge(work: Path, models: Path, results: Path) -> None:
     results.mkdir(parents=True, exist_ok=True)
     for name, (data, recipe), tta_rotations in product(NAMES, (("frames", "skd"), ("hard", "skd-hard")), (1, 4)):
         pages = work / "evaluation" / f"{name}_{data}_{tta_rotations}"
-        evaluate(work / data, model=models / name, split="test", out=pages, tta_rotations=tta_rotations)
+        pages.mkdir(parents=True, exist_ok=True)
+        estimator = load_estimator(models / name, tta_rotations=tta_rotations)
+        dataset = open_dataset(work / data, estimator.spacecraft, "test", 1)
+        section = evaluate_section(dataset, estimator, f"{data}, split test", pictures=6)
+        write_report(pages, f"Pose of {name} on {data}", [section], section.evaluation.to_dict())
         shutil.copyfile(
             pages / "metrics.json", results / f"{name}_{recipe}{'_tta4' if tta_rotations == 4 else ''}.json"
         )

@@ -17,7 +17,7 @@ from tests.cli.toy import ToyEstimator
 def bundled(monkeypatch: pytest.MonkeyPatch, dataset: Path, use: Callable[[ToyEstimator], None]) -> None:
     use(ToyEstimator(error=1.0, blind=frozenset({2})))
     monkeypatch.setattr("gknet.inference.load.shipped_models", lambda: ("toycraft",))
-    monkeypatch.setattr("gknet.cli.demo.bundled_frames", lambda: dataset)
+    monkeypatch.setattr("gknet.dataset.demo_frames.bundled_frames", lambda: dataset)
 
 
 @pytest.mark.usefixtures("bundled")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gknet.cli import doctor
-from gknet.cli.doctor import Finding, State
+from gknet.cli.doctor import CheckStatus, Finding
 from gknet.cli.main import run
 from gknet.errors import GknetError
 from gknet.inference.crop_estimator import InferenceSettings
@@ -42,7 +42,7 @@ def model(monkeypatch: pytest.MonkeyPatch) -> Callable[[ToyModel], None]:
 
 def test_core_is_well() -> None:
     for finding in (doctor._python(), doctor._core_libraries(), doctor._providers(), doctor._disk()):
-        assert finding.state in (State.good, State.note)
+        assert finding.status in (CheckStatus.good, CheckStatus.note)
     assert "numpy" in doctor._core_libraries().words
     assert "CPUExecutionProvider" in doctor._providers().words
 
@@ -50,51 +50,51 @@ def test_core_is_well() -> None:
 def test_shipped_models_are_well() -> None:
     findings = list(doctor._models())
     assert [finding.what for finding in findings] == [f"model satellite_0{k}" for k in (1, 2, 3)]
-    assert all(finding.state is State.good for finding in findings), findings
+    assert all(finding.status is CheckStatus.good for finding in findings), findings
 
 
 def test_model_is_run(model: Callable[[ToyModel], None]) -> None:
     model(ToyModel())
     (finding,) = doctor._models()
-    assert finding.state is State.good
+    assert finding.status is CheckStatus.good
     assert "keypoints 13 x 64 x 64" in finding.words
 
 
 def test_model_of_another_shape_is_bad(model: Callable[[ToyModel], None]) -> None:
     model(ToyModel(channels=12))
     (finding,) = doctor._models()
-    assert finding.state is State.bad
+    assert finding.status is CheckStatus.bad
     assert "expected 13 finite maps" in finding.words
 
 
 def test_a_missing_extra_is_a_note_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_versions", lambda packages: ({}, list(packages)))
     finding = doctor._extra("train")
-    assert (finding.state, finding.words) == (State.note, "not installed")
+    assert (finding.status, finding.words) == (CheckStatus.note, "not installed")
     assert "gknet[train]" in finding.remedy
-    assert doctor._renderer().state is State.note
-    assert doctor._core_libraries().state is State.bad
+    assert doctor._renderer().status is CheckStatus.note
+    assert doctor._core_libraries().status is CheckStatus.bad
 
 
 def test_renderer_without_llvm_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mitsuba")
     monkeypatch.setattr("gknet.render.scene.choose_variant", lambda: "scalar_rgb")
-    assert doctor._renderer().state is State.note
+    assert doctor._renderer().status is CheckStatus.note
 
     def broken() -> str:
         raise GknetError("no variant works")
 
     monkeypatch.setattr("gknet.render.scene.choose_variant", broken)
-    assert doctor._renderer().state is State.bad
+    assert doctor._renderer().status is CheckStatus.bad
 
 
 def test_exit_codes(
     monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda: [Finding("disk", State.note, "[full]", "pip install 'x[y]'")])
+    monkeypatch.setattr(doctor, "examine", lambda: [Finding("disk", CheckStatus.note, "[full]", "pip install 'x[y]'")])
     assert run(["doctor"]) == 0
     printed = capfd.readouterr().out
     assert "[full]" in printed
     assert "'x[y]'" in printed
-    monkeypatch.setattr(doctor, "examine", lambda: [Finding("models", State.bad, "none")])
+    monkeypatch.setattr(doctor, "examine", lambda: [Finding("models", CheckStatus.bad, "none")])
     assert refused("doctor") == "gknet: doctor: 1 of 1 checks failed: models"

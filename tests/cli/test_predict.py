@@ -5,20 +5,27 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy import ndarray
 
 from gknet.cli.main import run
-from gknet.cli.predict import choose_estimator
+from gknet.cli.model_options import open_estimator
 from gknet.dataset.skd import SkdDataset
-from gknet.frame import Box
+from gknet.frame import Box, Estimate, Frame
+from gknet.geometry import Camera
+from gknet.inference.load import shipped_folder
 from gknet.io.image import read_image, write_image
+from gknet.io.interrupt import Interrupted
+from gknet.io.lock import LOCK_NAME
 from gknet.io.video import VideoWriter, open_video
-from tests.cli.toy import FOCAL_PX, SIZE, Noting, ToyEstimator, toy_picture, toy_pose
+from tests.cli.toy import FOCAL_PX, SIZE, Noting, ToyEstimator, picture_number, toy_picture, toy_pose
 
 Use = Callable[[ToyEstimator], None]
 Refused = Callable[..., str]
@@ -53,7 +60,8 @@ def records(out: Path) -> list[dict[str, object]]:
 
 
 def leftovers(out: Path) -> list[Path]:
-    return [path for path in out.rglob("*") if path.is_file()] if out.exists() else []
+    """What a run left, but for the lock."""
+    return [path for path in out.rglob("*") if path.is_file() and path.name != LOCK_NAME] if out.exists() else []
 
 
 def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
@@ -70,7 +78,7 @@ def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
     assert record["keypoints"][12]["name"] == "mast"
     overlay = read_image(out / "overlays" / "a.jpg")
     assert max(overlay.shape) == 3 * SIZE
-    assert sorted(path.name for path in leftovers(out)) == ["a.jpg", "poses.jsonl"]
+    assert sorted(path.name for path in leftovers(out)) == ["a.jpg", "poses.jsonl", "prediction.json"]
 
 
 def test_folder_goes_on_past_bad_pictures(
@@ -93,7 +101,7 @@ def test_folder_goes_on_past_bad_pictures(
     words = capsys.readouterr().out
     assert "2 of 5 pictures have a pose, 3 failed" in words
     assert "truncated" in words
-    assert "1 of the poses may be a twin's" in words
+    assert "1 of the poses may be that of a symmetric counterpart" in words
     assert [record.get("attitude_confidence") for record in records(out)] == [0.9, None, 0.2, None, None]
     assert (out / "overlays" / "deep_c.jpg").exists()
 
@@ -155,7 +163,7 @@ def test_the_truth_is_taken_only_when_it_is_asked_for(use: Use, dataset: Path, t
     for words, boxes in (((), [None] * 10), (("--oracle",), [frame_box(dataset, i) for i in range(10)])):
         estimator = Noting()
         use(estimator)
-        assert predict(dataset, *MODEL, "--no-overlay", "--out", tmp_path / "out", *words) == 0
+        assert predict(dataset, *MODEL, "--no-overlay", "--overwrite", "--out", tmp_path / "out", *words) == 0
         assert estimator.given == boxes
 
 
@@ -181,7 +189,7 @@ def test_no_pose_at_all_is_two_but_is_recorded(use: Use, refused: Refused, pictu
 
 CAMERA_TEXTS = {
     "not JSON": ("camera.json", "{", "not valid JSON"),
-    "a list": ("camera.json", "[1, 2]", "expected a JSON object"),
+    "a list": ("camera.json", "[1, 2]", "expected a camera file"),
     "unknown key": (
         "camera.json",
         '{"matrix": [[1,0,0],[0,1,0],[0,0,1]], "width": 9, "height": 9, "f": 1}',
@@ -195,8 +203,8 @@ CAMERA_TEXTS = {
     "half a pixel": ("camera.json", '{"matrix": [[9,0,4],[0,9,4],[0,0,1]], "width": 9.5, "height": 9}', "width"),
     "other size": ("camera.json", '{"matrix": [[9,0,4],[0,9,4],[0,0,1]], "width": 9, "height": 9}', "256 x 256"),
     "text 2 x 3": ("camera_matrix.txt", "1, 2, 3\n4, 5, 6\n", "3 x 3"),
-    "text words": ("camera_matrix.txt", "a, b, c\n1, 2, 3\n1, 2, 3\n", "numbers"),
-    "text NaN": ("camera_matrix.txt", "nan, 0, 1\n0, 1, 1\n0, 0, 1\n", "finite"),
+    "text words": ("camera_matrix.txt", "a, b, c\n1, 2, 3\n1, 2, 3\n", "expected a camera file"),
+    "text NaN": ("camera_matrix.txt", "1, nan, 1\n0, 1, 1\n0, 0, 1\n", "finite"),
 }
 
 
@@ -226,6 +234,16 @@ BAD_OPTIONS = {
     "oracle without truth": ((*MODEL, *LENS, "--oracle"), "true poses"),
     "every 0": ((*MODEL, *LENS, "--every", "0"), "every"),
     "no threads": ((*MODEL, *LENS, "--threads", "0"), "--threads"),
+    "infinite every": ((*MODEL, *LENS, "--every", "inf"), "--every"),
+    "many threads": ((*MODEL, *LENS, "--threads", "99999"), "--threads"),
+    "infinite focal": ((*MODEL, "--focal-px", "inf"), "focal length"),
+    "NaN field": ((*MODEL, "--hfov-deg", "nan"), "field of view"),
+    "infinite box": ((*MODEL, *LENS, "--box", "0,0,inf,9"), "box"),
+    "no camera to scale": ((*MODEL, *LENS, "--scale-camera"), "--camera FILE"),
+    "size of no camera": ((*MODEL, *LENS, "--camera-size", "9x9"), "--camera FILE"),
+    "size in words": ((*MODEL, "--camera", "c.json", "--camera-size", "big"), "WxH"),
+    "resume and overwrite": ((*MODEL, *LENS, "--resume", "--overwrite"), "one of the two"),
+    "resume of a film": ((*MODEL, *LENS, "--resume", "--video"), "one of the two"),
     "unknown layout": ((*MODEL, *LENS, "--format", "xml"), "xml"),
 }
 
@@ -270,7 +288,7 @@ def test_video_without_frames(use: Use, refused: Refused, tmp_path: Path) -> Non
 
 
 def test_turns_reach_the_estimator(refused: Refused, pictures: Path, tmp_path: Path) -> None:
-    assert choose_estimator("satellite_01", None, 1, 4).settings.tta_rotations == 4
+    assert open_estimator(shipped_folder("satellite_01"), 1, "cpu", 4).settings.tta_rotations == 4
     shipped = ("--spacecraft", "satellite_01", *LENS)
     line = refused("predict", pictures / "a.jpg", *shipped, "--tta-rotations", "3", "--out", tmp_path / "out")
     assert "1, 2 or 4" in line
@@ -287,7 +305,7 @@ def test_unknown_spacecraft(refused: Refused, pictures: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("test.json", "{", "cannot read the split file"),
+        ("test.json", "{", "not valid JSON"),
         ("test.json", '["data/000001"]', "expected"),
         ("data/000001/annotations.csv", "category,position\n", "orientation"),
         ("data/000001/annotations.csv", "category,position,orientation\nToycraft,[1,2,3]\n", "cells"),
@@ -322,28 +340,177 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, error: BaseException, picture: int)
     monkeypatch.setattr(ToyEstimator, "estimate", estimate)
 
 
-def test_interrupt_leaves_nothing_half_written(
-    use: Use, refused: Refused, film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_interrupt_keeps_what_was_found_and_resume_goes_on(
+    use: Use, refused: Refused, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use(ToyEstimator())
-    stop_at(monkeypatch, KeyboardInterrupt(), 2)
     out = tmp_path / "out"
-    refused("predict", film, *MODEL, *LENS, "--video", "--out", out, code=130)
-    assert [path.parent.name for path in leftovers(out)] == ["overlays", "overlays"]
+    with monkeypatch.context() as patch:
+        stop_at(patch, Interrupted(signal.SIGTERM), 2)
+        refused("predict", pictures, *MODEL, *LENS, "--out", out, code=143)
+    assert [record["name"] for record in records(out)] == ["a.jpg", "b.png"]
+    first = (out / "poses.jsonl").read_text()
+    estimator = Noting()
+    use(estimator)
+    assert predict(pictures, *MODEL, *LENS, "--out", out, "--resume") == 0
+    assert len(estimator.given) == 1
+    assert (out / "poses.jsonl").read_text().startswith(first)
+    whole = tmp_path / "whole"
+    assert predict(pictures, *MODEL, *LENS, "--out", whole) == 0
+    assert records(out) == records(whole)
+    assert sorted(path.name for path in leftovers(out)) == sorted(path.name for path in leftovers(whole))
 
 
-def test_full_disk_leaves_nothing_half_written(
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stop_signal_ends_after_the_picture_and_says_what_is_kept(
+    number: int, code: int, use: Use, refused: Refused, film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(ToyEstimator())
+    honest = ToyEstimator.estimate
+
+    def estimate(self: ToyEstimator, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
+        os.kill(os.getpid(), number)
+        return honest(self, image, camera, box)
+
+    monkeypatch.setattr(ToyEstimator, "estimate", estimate)
+    out = tmp_path / "out"
+    line = refused("predict", film, *MODEL, *LENS, "--video", "--out", out, code=code)
+    assert "interrupted; the results of 1 pictures are in" in line
+    assert "--resume" in line
+    assert len(records(out)) == 1
+    assert open_video(out / "overlay.mp4").announced == 1
+
+
+def test_an_interrupted_rerun_leaves_the_better_result(
     use: Use, refused: Refused, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
+    before = records(out)
+    stop_at(monkeypatch, KeyboardInterrupt(), 1)
+    refused("predict", pictures, *MODEL, *LENS, "--out", out, code=130)
+    assert records(out) == before
+
+
+def test_a_full_disk_costs_overlays_and_no_pose(
+    use: Use, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     use(ToyEstimator())
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gknet.predict.results.write_image", full)
+    monkeypatch.setattr("gknet.predict.overlay_files.write_image", full)
+    monkeypatch.setattr("gknet.io.video.VideoWriter.write", full)
     out = tmp_path / "out"
-    assert "No space left" in refused("predict", pictures, *MODEL, *LENS, "--video", "--out", out)
-    assert leftovers(out) == []
+    assert predict(pictures, *MODEL, *LENS, "--video", "--out", out) == 0
+    assert len(records(out)) == 3
+    words = capsys.readouterr().err
+    assert "warning: 3 overlays could not be written; the first, a.jpg: " in words
+    assert "warning: 3 frames of the film could not be written" in words
+
+
+def test_results_of_another_run_are_refused_and_replaced_when_asked(
+    use: Use, refused: Refused, pictures: Path, film: Path, tmp_path: Path
+) -> None:
+    use(ToyEstimator())
+    out = tmp_path / "out"
+    assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
+    before = records(out)
+    assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
+    for extra in ((), ("--resume",)):
+        line = refused("predict", film, *MODEL, *LENS, "--out", out, *extra)
+        assert "another run (inputs" in line
+        assert "--overwrite" in line
+        assert records(out) == before
+    assert predict(film, *MODEL, *LENS, "--out", out, "--overwrite") == 0
+    assert sorted(path.name for path in (out / "overlays").iterdir()) == [f"film_00000{k}.jpg" for k in range(6)]
+    (out / "prediction.json").unlink()
+    assert "there is no prediction.json" in refused("predict", film, *MODEL, *LENS, "--out", out)
+
+
+def test_pictures_of_like_names_have_overlays_of_their_own(use: Use, tmp_path: Path) -> None:
+    use(ToyEstimator())
+    names = ("cam1/0001.jpg", "cam1_0001.jpg", "cam1_0001.png", "CAM1_0001.bmp")
+    folder = tmp_path / "pictures"
+    (folder / "cam1").mkdir(parents=True)
+    for number, name in enumerate(names):
+        write_image(folder / name, toy_picture(number))
+    out = tmp_path / "out"
+    assert predict(folder, *MODEL, *LENS, "--out", out) == 0
+    assert len(list((out / "overlays").iterdir())) == 4
+
+
+ODD_NAMES = {
+    "not UTF-8": os.fsdecode(b"caf\xe9"),
+    "250 bytes": "z" * 246,
+    "a formula": "=cmd|' !A0",
+    "escape": "a\x1b[31mb\x07",
+    "markup": "[red]a [v2]",
+    "colon": "a:b?c*",
+    "a line end": "a\nb",
+    "no Latin": "衛星",
+}
+
+
+@pytest.mark.parametrize("layout", ["jsonl", "csv"])
+@pytest.mark.parametrize("case", ODD_NAMES)
+def test_odd_names(case: str, layout: str, use: Use, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    use(ToyEstimator(blind=frozenset({1})))
+    folder = tmp_path / f"in {ODD_NAMES[case][:100]}"
+    folder.mkdir()
+    for number, suffix in enumerate((".jpg", ".png")):
+        write_image(folder / "a.png", toy_picture(number))
+        os.replace(folder / "a.png", folder / f"{ODD_NAMES[case]}{suffix}")
+    out = tmp_path / f"out {ODD_NAMES[case][:100]}"
+    film = () if case == "not UTF-8" else ("--video",)
+    assert predict(folder, *MODEL, *LENS, "--out", out, "--format", layout, *film) == 0
+    printed = capsys.readouterr()
+    for text in (printed.out, printed.err):
+        text.encode("utf-8")
+        assert not set(text) & {"\x1b", "\x07"}
+    assert len(list((out / "overlays").iterdir())) == 2
+    assert (out / "overlay.mp4").exists() == bool(film)
+    text = (out / f"poses.{layout}").read_text(encoding="utf-8")
+    assert len(text.splitlines()) == 2 + (layout == "csv")
+    assert not any(line.startswith(("=", '"=')) for line in text.splitlines())
+    assert predict(folder, *MODEL, *LENS, "--out", out, "--format", layout, "--resume") == 0
+    assert (out / f"poses.{layout}").read_text(encoding="utf-8") == text
+    assert "2 of them from an earlier run" in capsys.readouterr().out
+
+
+def test_an_oracle_without_keypoints_in_view_is_a_failure_of_its_kind(
+    use: Use, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimator = Noting()
+    use(estimator)
+    honest = Frame.true_box
+    monkeypatch.setattr(
+        Frame, "true_box", lambda frame, points: None if frame.name.endswith("/000002") else honest(frame, points)
+    )
+    out = tmp_path / "out"
+    assert predict(dataset, *MODEL, "--oracle", "--no-overlay", "--out", out) == 0
+    assert None not in estimator.given
+    kinds = [record["failure"]["kind"] for record in records(out) if record["failure"]]
+    assert kinds == ["no_keypoint_in_view"] * 2
+
+
+def test_one_picture_that_the_estimator_refuses_costs_no_other(
+    use: Use, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(ToyEstimator())
+    honest = ToyEstimator.estimate
+
+    def estimate(self: ToyEstimator, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
+        if picture_number(image) == 1:
+            raise MemoryError
+        return honest(self, image, camera, box)
+
+    monkeypatch.setattr(ToyEstimator, "estimate", estimate)
+    out = tmp_path / "out"
+    assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
+    assert [record["status"] for record in records(out)] == ["ok", "unreadable", "ok"]
 
 
 def test_out_is_a_file(use: Use, refused: Refused, pictures: Path, tmp_path: Path) -> None:

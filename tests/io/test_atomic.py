@@ -31,7 +31,7 @@ def test_permissions_are_those_of_the_umask(tmp_path: Path, umask: int) -> None:
 
 
 def write_half(path: Path, keep_on_error: bool) -> None:
-    with replacing(path, keep_on_error=keep_on_error) as temporary:
+    with replacing(path, keep_on_error=lambda: keep_on_error) as temporary:
         temporary.write_bytes(b"half")
         raise KeyboardInterrupt
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +13,10 @@ import pytest
 
 from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Pose
-from gknet.io.pose_file import PoseWriter, csv_columns, csv_row, record, unreadable_record
+from gknet.io.pose_file import PoseFormat, PoseWriter, csv_columns, csv_row, read_poses, record, unreadable_record
 
 NAMES = ("a", "b")
+LAYOUTS: tuple[PoseFormat, ...] = ("jsonl", "csv")
 
 
 def estimate() -> Estimate:
@@ -81,7 +85,72 @@ def test_file_appears_at_the_end_only(tmp_path: Path) -> None:
         writer.add_unreadable("y", Failure(FailureKind.UNREADABLE_IMAGE, "gone"))
         assert not path.exists()
     assert [json.loads(line)["name"] for line in path.read_text().splitlines()] == ["x", "y"]
-    other = PoseWriter(tmp_path / "other.csv", NAMES, "csv")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_an_error_keeps_what_was_added(tmp_path: Path, layout: PoseFormat) -> None:
+    path = tmp_path / "poses"
     with pytest.raises(KeyboardInterrupt):
-        interrupted(other)
-    assert [path.name for path in tmp_path.iterdir()] == ["poses.jsonl"]
+        interrupted(PoseWriter(path, NAMES, layout))
+    assert [line.name for line in read_poses(path, layout)] == ["x"]
+    assert [each.name for each in tmp_path.iterdir()] == ["poses"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_an_error_never_replaces_more_by_less(tmp_path: Path, layout: PoseFormat) -> None:
+    path = tmp_path / "poses"
+    with PoseWriter(path, NAMES, layout) as writer:
+        writer.add("a", None, estimate())
+        writer.add("b", None, estimate())
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(PoseWriter(path, NAMES, layout))
+    assert [line.name for line in read_poses(path, layout)] == ["a", "b"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_lines_come_back(tmp_path: Path, layout: PoseFormat) -> None:
+    path = tmp_path / "poses"
+    dark = Failure(FailureKind.NO_SPACECRAFT, '=dark,\n "here"')
+    with PoseWriter(path, NAMES, layout) as writer:
+        writer.add("=a, 'b'", 0.5, estimate())
+        writer.add("b", None, replace(estimate(), attitude_confidence=0.2))
+        writer.add("c", None, Estimate(failure=dark))
+        writer.add_unreadable("d", Failure(FailureKind.UNREADABLE_IMAGE, "gone"))
+    lines = read_poses(path, layout)
+    assert [line.name for line in lines] == ["=a, 'b'", "b", "c", "d"]
+    assert [line.failure and line.failure.kind for line in lines] == [
+        None,
+        None,
+        FailureKind.NO_SPACECRAFT,
+        FailureKind.UNREADABLE_IMAGE,
+    ]
+    assert [line.is_ambiguous for line in lines] == [False, True, False, False]
+    assert [line.is_unreadable for line in lines] == [False, False, False, True]
+    whole = path.read_bytes()
+    with PoseWriter(path, NAMES, layout, kept=lines):
+        pass
+    assert path.read_bytes() == whole
+    path.write_bytes(whole[:-20])
+    assert [line.name for line in read_poses(path, layout)] == ["=a, 'b'", "b", "c"]
+    assert read_poses(tmp_path / "none", layout) == []
+
+
+def test_a_full_disk_leaves_whole_lines(tmp_path: Path) -> None:
+    """With the size of files limited, the write that passes the limit fails as on a full disk."""
+    code = """
+import resource, signal, sys
+from tests.io.test_pose_file import NAMES, estimate
+from gknet.io.pose_file import PoseWriter
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+with PoseWriter(sys.argv[1], NAMES, "jsonl") as writer:
+    for k in range(1000):
+        writer.add(f"{k}", None, estimate())
+"""
+    path = tmp_path / "poses.jsonl"
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    assert "OSError" in done.stderr
+    assert str(path) in done.stderr.splitlines()[-1]
+    text = path.read_text()
+    assert len(text) > 3000
+    assert [json.loads(line)["name"] for line in text.splitlines()] == [f"{k}" for k in range(text.count("\n"))]

@@ -108,8 +108,8 @@ def test_words() -> None:
     assert confidence(estimate) == pytest.approx(estimate.keypoints.score.mean())
     assert describe(frame, Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))) == ["toy/1", "no pose: dark"]
     assert confidence(Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark"))) is None
-    for belief, said in ((0.97, "belief in the attitude 0.97"), (0.31, "belief in the attitude 0.31, perhaps a twin")):
-        assert describe(frame, replace(estimate, attitude_confidence=belief))[3] == said
+    for value, words in ((0.97, "attitude confidence 0.97"), (0.31, "attitude confidence 0.31, ambiguous")):
+        assert describe(frame, replace(estimate, attitude_confidence=value))[3] == words
 
 
 def test_score_colours_grow_lighter() -> None:

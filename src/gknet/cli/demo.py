@@ -7,77 +7,72 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gknet.cli.model_options import DeviceOption, ThreadsOption, open_estimator
+from gknet.cli.terminal import print_line, print_table, print_warning
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
     from gknet.dataset.skd import SkdDataset
-    from gknet.evaluation.evaluate import Evaluation
-    from gknet.frame import PoseEstimator
     from gknet.report.page import Section
+    from gknet.spacecraft import Spacecraft
 
 _FPS = 6.0
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for poses, overlays, video and report.")] = Path("demo-output"),
-    threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
+    threads: ThreadsOption = None,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Estimate the poses of the bundled test frames and compare them with the truth."""
     import time
 
-    from rich.console import Console
-
+    from gknet.dataset.demo_frames import bundled_frames
     from gknet.dataset.skd import open_dataset
-    from gknet.inference.load import load_estimator, shipped_models
+    from gknet.inference.load import shipped_folder, shipped_models
+    from gknet.io.atomic import output_folder
+    from gknet.io.progress import progress
     from gknet.report.table import comparison_table
+    from gknet.report.write import evaluate_section, write_report
 
     start = time.perf_counter()
     names = shipped_models()
     if not names:
         raise GknetError("demo: no model is shipped with this installation; install gknet from a built wheel")
-    folder = bundled_frames()
-    out.mkdir(parents=True, exist_ok=True)
+    frames = bundled_frames()
     sections: list[Section] = []
     written: list[Path] = []
-    for name in names:
-        estimator = load_estimator(name, threads=threads)
-        section, paths = show(open_dataset(folder, estimator.spacecraft, None, 1), estimator, out)
-        sections.append(section)
-        written += paths
-    written += write_comparison(out, sections)
-    Console().print(comparison_table([s.evaluation for s in sections], "errors against the truth, bundled test frames"))
+    with output_folder(out):
+        for name in names:
+            estimator = open_estimator(shipped_folder(name), threads, device)
+            dataset = open_dataset(frames, estimator.spacecraft, None, 1)
+            with progress() as bar:
+                task = bar.add_task(name, total=len(dataset))
+                section = evaluate_section(
+                    dataset,
+                    estimator,
+                    "bundled test frames",
+                    3,
+                    lambda: bar.advance(task),  # noqa: B023
+                )
+            sections.append(section)
+            written += write_results(out / estimator.spacecraft.name, dataset, estimator.spacecraft, section)
+        evaluations = [section.evaluation for section in sections]
+        content: dict[str, object] = {each.spacecraft.name: each.to_dict() for each in evaluations}
+        written += write_report(out, "gknet demo", sections, {"spacecraft": content})
+    print_table(comparison_table(evaluations, "errors against the truth, bundled test frames"))
     for path in written:
-        typer.echo(f"wrote {path}")
-    typer.echo(f"done in {time.perf_counter() - start:.1f} s")
+        print_line(f"wrote {path}")
+    print_line(f"done in {time.perf_counter() - start:.1f} s")
 
 
-def bundled_frames() -> Path:
-    """The folder of test frames that ships with the package."""
-    from importlib import resources
-
-    folder = Path(str(resources.files("gknet") / "demo_data"))
-    if not (folder / "test.json").is_file():
-        raise GknetError("demo: the bundled test frames are missing; install gknet from a built wheel")
-    return folder
-
-
-def show(dataset: SkdDataset, estimator: PoseEstimator, out: Path) -> tuple[Section, list[Path]]:
-    """Evaluate one spacecraft, and write its poses, overlays and video of the last protocol."""
-    from gknet.cli.evaluate import evaluate_section
+def write_results(folder: Path, dataset: SkdDataset, spacecraft: Spacecraft, section: Section) -> list[Path]:
+    """Write the poses, overlays and video of an evaluation's last protocol."""
     from gknet.predict.results import PredictionWriter
 
-    section = evaluate_section(dataset, estimator, "bundled test frames", pictures=3)
-    folder = out / estimator.spacecraft.name
-    with PredictionWriter(folder, estimator.spacecraft, fps=_FPS) as files:
+    with PredictionWriter(folder, spacecraft, fps=_FPS) as writer:
         for case in section.evaluation.runs[-1].cases:
-            files.add(dataset.frame(case.index), case.estimate)
-    return section, [path for path in (files.poses_path, files.overlay_folder, files.video_path) if path is not None]
-
-
-def write_comparison(out: Path, sections: list[Section]) -> tuple[Path, Path]:
-    """metrics.json and the page over all spacecraft."""
-    from gknet.cli.evaluate import write_report
-
-    evaluations: list[Evaluation] = [section.evaluation for section in sections]
-    content: dict[str, object] = {e.spacecraft.name: e.to_dict() for e in evaluations}
-    return write_report(out, "gknet demo", sections, {"spacecraft": content})
+            writer.add(dataset.frame(case.index), case.estimate)
+    for sentence in writer.losses:
+        print_warning(sentence)
+    return [path for path in (writer.poses_path, writer.overlay_folder, writer.video_path) if path is not None]

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from gknet.cli.terminal import print_table
 from gknet.errors import GknetError
+from gknet.io.text import printable
 
 _CORE = (
     *("numpy", "scipy", "opencv-python-headless", "onnxruntime", "poselib", "pydantic", "typer", "rich", "jaxtyping"),
@@ -22,7 +24,7 @@ _EXTRAS = {
 _ENOUGH_BYTES = 1_000_000_000
 
 
-class State(StrEnum):
+class CheckStatus(StrEnum):
     """`note` is worth knowing and no fault; `bad` makes the command end with code 2."""
 
     good = "ok"
@@ -32,29 +34,29 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. `remedy` says what to do, where something can be done."""
+    """The result of one check. `remedy` is what to do, where something can be done."""
 
     what: str
-    state: State
+    status: CheckStatus
     words: str
     remedy: str = ""
 
 
 def doctor() -> None:
     """Check this installation: libraries, models, extras, processor, disk."""
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
-    colours = {State.good: "green", State.note: "yellow", State.bad: "bold red"}
+    colours = {CheckStatus.good: "green", CheckStatus.note: "yellow", CheckStatus.bad: "bold red"}
     table = Table(show_header=False, box=None, pad_edge=False)
     findings = list(examine())
     for finding in findings:
-        remedy = f"\n[dim]{escape(finding.remedy)}[/dim]" if finding.remedy else ""
-        words = escape(finding.words) + remedy
-        table.add_row(f"[{colours[finding.state]}]{finding.state}[/]", finding.what, words)
-    Console().print(table)
-    bad = [finding.what for finding in findings if finding.state is State.bad]
+        words = Text(printable(finding.words))
+        if finding.remedy:
+            words.append(f"\n{printable(finding.remedy)}", style="dim")
+        table.add_row(Text(finding.status, style=colours[finding.status]), Text(printable(finding.what)), words)
+    print_table(table)
+    bad = [finding.what for finding in findings if finding.status is CheckStatus.bad]
     if bad:
         raise GknetError(f"doctor: {len(bad)} of {len(findings)} checks failed: {', '.join(bad)}")
 
@@ -89,24 +91,26 @@ def _versions(packages: tuple[str, ...]) -> tuple[dict[str, str], list[str]]:
 def _python() -> Finding:
     from gknet import __version__
 
-    return Finding("python", State.good, f"Python {sys.version.split()[0]} with gknet {__version__}, {sys.platform}")
+    return Finding(
+        "python", CheckStatus.good, f"Python {sys.version.split()[0]} with gknet {__version__}, {sys.platform}"
+    )
 
 
 def _core_libraries() -> Finding:
     found, missing = _versions(_CORE)
     words = ", ".join(f"{package} {number}" for package, number in found.items())
     if missing:
-        return Finding("core libraries", State.bad, f"missing: {', '.join(missing)}", "pip install gknet")
-    return Finding("core libraries", State.good, words)
+        return Finding("core libraries", CheckStatus.bad, f"missing: {', '.join(missing)}", "pip install gknet")
+    return Finding("core libraries", CheckStatus.good, words)
 
 
 def _providers() -> Finding:
     try:
         from gknet.inference.onnx_session import available_providers
     except ImportError as error:
-        return Finding("onnxruntime", State.bad, f"cannot be imported: {error}", "pip install onnxruntime")
+        return Finding("onnxruntime", CheckStatus.bad, f"cannot be imported: {error}", "pip install onnxruntime")
     providers = available_providers()
-    state = State.good if "CPUExecutionProvider" in providers else State.bad
+    state = CheckStatus.good if "CPUExecutionProvider" in providers else CheckStatus.bad
     return Finding("onnxruntime", state, f"providers: {', '.join(providers)}")
 
 
@@ -116,12 +120,14 @@ def _models() -> Iterator[Finding]:
 
     names = shipped_models()
     if not names:
-        yield Finding("models", State.bad, "none is shipped with this installation", "install gknet from a built wheel")
+        yield Finding(
+            "models", CheckStatus.bad, "none is shipped with this installation", "install gknet from a built wheel"
+        )
     for name in names:
         try:
-            yield Finding(f"model {name}", State.good, _try_model(name))
+            yield Finding(f"model {name}", CheckStatus.good, _try_model(name))
         except GknetError as error:
-            yield Finding(f"model {name}", State.bad, str(error), "install gknet again")
+            yield Finding(f"model {name}", CheckStatus.bad, str(error), "install gknet again")
 
 
 def _try_model(name: str) -> str:
@@ -161,36 +167,36 @@ def _try_model(name: str) -> str:
 
 
 def _demo_frames() -> Finding:
-    from gknet.cli.demo import bundled_frames
+    from gknet.dataset.demo_frames import bundled_frames
 
     try:
-        return Finding("demo frames", State.good, str(bundled_frames()))
+        return Finding("demo frames", CheckStatus.good, str(bundled_frames()))
     except GknetError as error:
-        return Finding("demo frames", State.note, str(error))
+        return Finding("demo frames", CheckStatus.note, str(error))
 
 
 def _extra(extra: str) -> Finding:
     found, missing = _versions(_EXTRAS[extra])
     if missing:
         words = "not installed" if not found else f"missing: {', '.join(missing)}"
-        return Finding(f"extra {extra}", State.note, words, f"pip install 'gknet[{extra}]'")
-    return Finding(f"extra {extra}", State.good, ", ".join(f"{p} {v}" for p, v in found.items()))
+        return Finding(f"extra {extra}", CheckStatus.note, words, f"pip install 'gknet[{extra}]'")
+    return Finding(f"extra {extra}", CheckStatus.good, ", ".join(f"{p} {v}" for p, v in found.items()))
 
 
 def _renderer() -> Finding:
     """Which of Mitsuba's variants a render would take."""
     if _versions(("mitsuba",))[1]:
-        return Finding("renderer", State.note, "not installed", "pip install 'gknet[render]'")
+        return Finding("renderer", CheckStatus.note, "not installed", "pip install 'gknet[render]'")
     try:
         from gknet.render.scene import choose_variant
 
         variant = choose_variant()
     except (GknetError, ImportError, OSError) as error:
-        return Finding("renderer", State.bad, str(error))
+        return Finding("renderer", CheckStatus.bad, str(error))
     if variant.startswith("scalar"):
         remedy = "install LLVM 19 (Debian: apt-get install libllvm19) to render several times faster"
-        return Finding("renderer", State.note, f"Mitsuba variant {variant}: slow", remedy)
-    return Finding("renderer", State.good, f"Mitsuba variant {variant}")
+        return Finding("renderer", CheckStatus.note, f"Mitsuba variant {variant}: slow", remedy)
+    return Finding("renderer", CheckStatus.good, f"Mitsuba variant {variant}")
 
 
 def _processor() -> Finding:
@@ -200,9 +206,11 @@ def _processor() -> Finding:
     flags = _processor_flags()
     words = f"{os.cpu_count()} cores"
     if flags is None:
-        return Finding("processor", State.note, f"{words}, bf16 unknown on this system")
+        return Finding("processor", CheckStatus.note, f"{words}, bf16 unknown on this system")
     fast = sorted({"amx_bf16", "avx512_bf16"} & flags)
-    return Finding("processor", State.good, f"{words}, bf16 by {', '.join(fast)}" if fast else f"{words}, no fast bf16")
+    return Finding(
+        "processor", CheckStatus.good, f"{words}, bf16 by {', '.join(fast)}" if fast else f"{words}, no fast bf16"
+    )
 
 
 def _processor_flags() -> set[str] | None:
@@ -218,5 +226,5 @@ def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     words = f"{free / 1e9:.1f} GB free in {Path.cwd()}"
     if free < _ENOUGH_BYTES:
-        return Finding("disk", State.note, words, "a rendered sequence takes about 50 MB")
-    return Finding("disk", State.good, words)
+        return Finding("disk", CheckStatus.note, words, "a rendered sequence takes about 50 MB")
+    return Finding("disk", CheckStatus.good, words)

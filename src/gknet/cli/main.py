@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated, cast
@@ -17,9 +18,11 @@ from gknet.cli.evaluate import evaluate
 from gknet.cli.fleet import fleet
 from gknet.cli.predict import predict
 from gknet.cli.render import render
+from gknet.cli.terminal import lasting_output
 from gknet.cli.train import export, train
 from gknet.errors import GknetError, MissingExtraError
 from gknet.io.interrupt import Interrupted, as_keyboard_interrupt
+from gknet.io.text import printable
 
 _USAGE_ERROR = cast(type[typer.BadParameter], typer.BadParameter.__mro__[1])
 """What typer raises for a wrong command line: the parent of its BadParameter, which it does not export."""
@@ -73,15 +76,42 @@ def run(arguments: Sequence[str]) -> int:
         The exit code: 0, 2 for bad input, 1 for a fault of gknet's own; 130 after Ctrl-C, 143 after SIGTERM, 129 after
         SIGHUP.
     """
+    with lasting_output() as output:
+        code = _run(arguments)
+        if output is not None:
+            output.flush()
+            if output.failure is not None and code == 0:
+                return _end(f"standard output: {_os_message(output.failure)}; the work is done", BAD_INPUT)
+    return code
+
+
+def _command() -> typer.core.TyperGroup:
+    """The command, with help texts in which rich sees no markup, so that their square brackets are shown."""
+    command = cast(typer.core.TyperGroup, typer.main.get_command(app))
+    for each in (command, *command.commands.values()):
+        each.help = each.help and _escaped(each.help)
+        for option in each.params:
+            if isinstance(option, typer.core.TyperOption | typer.core.TyperArgument) and option.help:
+                option.help = _escaped(option.help)
+    return command
+
+
+def _escaped(text: str) -> str:
+    """As `rich.markup.escape`, without loading rich."""
+    return re.sub(r"\[(?=[a-zA-Z#/@])", r"\\[", text)
+
+
+def _run(arguments: Sequence[str]) -> int:
     debug = os.environ.get("GKNET_DEBUG", "") not in ("", "0")
-    command = typer.main.get_command(app)
+    command = _command()
     try:
         with as_keyboard_interrupt(), command.make_context("gknet", list(arguments) or ["--help"]) as context:
             command.invoke(context)
     except typer.Exit as end:
         return end.exit_code
     except (KeyboardInterrupt, typer.Abort) as error:
-        return _end("interrupted", (error if isinstance(error, Interrupted) else Interrupted()).exit_code)
+        stop = error if isinstance(error, Interrupted) else Interrupted()
+        return _end(str(stop), stop.exit_code)
     except Exception as error:
         if debug and not isinstance(error, _USAGE_ERROR):
             raise
@@ -98,9 +128,6 @@ def _end_badly(error: Exception) -> int:
         module = (error.name or "").split(".")[0]
         if module in _EXTRA_OF_MODULE:
             return _end(str(MissingExtraError(_EXTRA_OF_MODULE[module], module)), BAD_INPUT)
-    if isinstance(error, BrokenPipeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BAD_INPUT
     if isinstance(error, OSError):
         return _end(_os_message(error), BAD_INPUT)
     if isinstance(error, MemoryError):
@@ -111,13 +138,14 @@ def _end_badly(error: Exception) -> int:
 def _os_message(error: OSError) -> str:
     place = f"{error.filename}: " if error.filename else ""
     reason = error.strerror or str(error)
-    remedy = "; free some space and run it again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+    remedy = "; free some space and run it again" if place and error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
     return f"{place}{reason}{remedy}"
 
 
 def _end(message: str, code: int) -> int:
     """One line on standard error, whatever the message holds."""
-    print(f"gknet: {' '.join(message.split())}", file=sys.stderr)
+    if sys.stderr is not None:
+        print(f"gknet: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code
 
 

@@ -1,64 +1,121 @@
-"""`gknet predict`: poses from an image, a folder of images, a video or a dataset."""
+"""`gknet predict`: poses from images, folders of images, videos or a dataset."""
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gknet.cli.model_options import (
+    DeviceOption,
+    ModelOption,
+    RotationsOption,
+    SpacecraftOption,
+    ThreadsOption,
+    model_folder,
+    open_estimator,
+)
+from gknet.cli.terminal import print_line, print_warning
 from gknet.errors import GknetError
 
 if TYPE_CHECKING:
-    from gknet.frame import Box, PoseEstimator
-    from gknet.io.camera_file import Lens
+    from gknet.frame import Box
+    from gknet.io.lens import Lens
     from gknet.predict.results import PredictionWriter
-    from gknet.predict.source import Source
 
 _SHOWN_FAILURES = 5
 
 
 class PoseLayout(StrEnum):
+    """How the file of poses is written."""
+
     jsonl = "jsonl"
     csv = "csv"
 
 
 def predict(
-    input_path: Annotated[Path, typer.Argument(metavar="INPUT", help="Image, folder of images, video or SKD dataset.")],
-    spacecraft: Annotated[str | None, typer.Option(help="A shipped model: satellite_01, satellite_02, ...")] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A folder with keypoints.onnx (or direct.onnx), locator.onnx.")
+    inputs: Annotated[
+        list[str],
+        typer.Argument(metavar="INPUT...", help="Images, folders of images, videos, or an SKD dataset."),
+    ],
+    spacecraft: SpacecraftOption = None,
+    model: ModelOption = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file: gknet's, OpenCV's, ROS's, Kalibr's, COLMAP's ... or a 3x3 text.")
     ] = None,
-    camera: Annotated[Path | None, typer.Option(help="Camera file: ours, SPEED+'s camera.json, or a 3x3 text.")] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of a centred camera.")] = None,
     hfov_deg: Annotated[float | None, typer.Option(help="Horizontal field of view of a centred camera.")] = None,
+    camera_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Image size of --camera, where its file does not state it.")
+    ] = None,
+    scale_camera: Annotated[
+        bool, typer.Option("--scale-camera", help="The pictures were resized: scale --camera to their size.")
+    ] = False,
     box: Annotated[str | None, typer.Option(help="Where the spacecraft is, as x0,y0,x1,y1 in pixels.")] = None,
-    oracle: Annotated[bool, typer.Option("--oracle", help="Take the box from a dataset's truth.")] = False,
+    oracle: Annotated[bool, typer.Option("--oracle", help="Take the box from a dataset's labels.")] = False,
     split: Annotated[str | None, typer.Option(help="Of a dataset: train, val or test.")] = None,
-    every: Annotated[int, typer.Option(help="Take each n-th picture.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Take each n-th picture.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("predictions"),
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the poses that are in --out, and go on.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace results of another run that are in --out.")
+    ] = False,
     layout: Annotated[PoseLayout, typer.Option("--format", help="Layout of the poses file.")] = PoseLayout.jsonl,
     overlay: Annotated[bool, typer.Option("--overlay/--no-overlay", help="Write overlay pictures.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Write an overlay video.")] = False,
-    threads: Annotated[int | None, typer.Option(help="Threads of the network; all cores by default.")] = None,
-    tta_rotations: Annotated[
-        int, typer.Option(help="Average the heatmaps of 1, 2 or 4 rotations of each crop: more accurate, slower.")
-    ] = 1,
+    threads: ThreadsOption = None,
+    device: DeviceOption = "cpu",
+    tta_rotations: RotationsOption = 1,
 ) -> None:
-    """Estimate the pose of a spacecraft in pictures."""
-    from gknet.predict.results import STILLS_FPS, PredictionWriter
+    """Estimate the pose of a spacecraft in pictures.
+
+    The poses found so far are kept whatever ends the run; --resume goes on with them.
+    """
+    from gknet.io.progress import progress
+    from gknet.predict.results import STILLS_FPS, Existing, PredictionWriter
+    from gknet.predict.run import predict_all
+    from gknet.predict.run_record import RunRecord
     from gknet.predict.source import open_source
 
     given_box = parse_box(box)
     if given_box is not None and oracle:
         raise GknetError("--box and --oracle: give one of the two")
-    estimator = choose_estimator(spacecraft, model, threads, tta_rotations)
-    source = open_source(input_path, choose_lens(camera, focal_px, hfov_deg), estimator.spacecraft, split, every)
+    if resume and (overwrite or video):
+        raise GknetError(f"--resume and {'--overwrite' if overwrite else '--video'}: give one of the two")
+    folder = model_folder(spacecraft, model)
+    lens = choose_lens(camera, focal_px, hfov_deg, parse_size(camera_size), scale_camera)
+    estimator = open_estimator(folder, threads, device, tta_rotations)
+    checked_inputs(inputs)
+    if len(inputs) > 1:
+        raise GknetError(f"INPUT: expected one, got {len(inputs)}")
+    source = open_source(inputs[0], lens, estimator.spacecraft, split, every)
+    record = RunRecord(
+        inputs=tuple(str(Path(text).absolute()) if Path(text).exists() else text for text in inputs),
+        model=str(folder.absolute()),
+        camera=_camera_words(camera, focal_px, hfov_deg, camera_size, scale_camera),
+        box=None if given_box is None else (given_box.x0, given_box.y0, given_box.x1, given_box.y1),
+        oracle=oracle,
+        split=split,
+        every=every,
+        tta_rotations=tta_rotations,
+    )
     fps = (source.fps or STILLS_FPS) if video else None
-    with PredictionWriter(out, estimator.spacecraft, layout.value, overlay, fps) as files:
-        predict_all(source, estimator, files, given_box, oracle)
-    tell(files)
+    existing: Existing = "overwrite" if overwrite else "resume" if resume else "same"
+    writer = PredictionWriter(out, estimator.spacecraft, layout.value, overlay, fps, record, existing)
+    with writer, progress() as bar:
+        pictures = bar.track(source, total=source.count, description="poses")
+        predict_all(pictures, estimator, writer, given_box, oracle)
+    print_summary(writer)
+
+
+def checked_inputs(inputs: list[str]) -> list[str]:
+    """The inputs; an empty one, which would mean the current folder, is refused."""
+    if not all(text.strip() for text in inputs):
+        raise GknetError("INPUT: expected an image, folder, video or dataset, got an empty name")
+    return inputs
 
 
 def parse_box(text: str | None) -> Box | None:
@@ -74,72 +131,77 @@ def parse_box(text: str | None) -> Box | None:
     return Box(x0, y0, x1, y1)
 
 
-def choose_lens(camera: Path | None, focal_px: float | None, hfov_deg: float | None) -> Lens | None:
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ "1920x1080" as (width, height)."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"([1-9]\d{0,5})[x×]([1-9]\d{0,5})", text.strip())
+    if found is None:
+        raise GknetError(f"--camera-size: expected WxH in pixels, such as 1920x1080, got '{text}'")
+    return int(found[1]), int(found[2])
+
+
+def choose_lens(
+    camera: Path | None,
+    focal_px: float | None,
+    hfov_deg: float | None,
+    size: tuple[int, int] | None,
+    scale: bool,
+) -> Lens | None:
     """The one camera option that was given, or None."""
     from math import radians
 
-    from gknet.io.camera_file import FieldOfView, read_camera
+    from gknet.io.camera_file import read_camera
+    from gknet.io.lens import FieldOfView, sized_lens
 
     if sum(option is not None for option in (camera, focal_px, hfov_deg)) > 1:
         raise GknetError("--camera, --focal-px and --hfov-deg: give one of the three")
     if camera is not None:
-        return read_camera(camera)
+        return sized_lens(read_camera(camera), size, scale)
+    if size is not None or scale:
+        raise GknetError(
+            f"{'--camera-size' if size else '--scale-camera'}: it changes a camera file; give --camera FILE"
+        )
     if focal_px is None and hfov_deg is None:
         return None
     return FieldOfView(focal_px, None if hfov_deg is None else radians(hfov_deg))
 
 
-def choose_estimator(
-    spacecraft: str | None, model: Path | None, threads: int | None, tta_rotations: int = 1
-) -> PoseEstimator:
-    """The shipped model of a spacecraft, or a user's folder."""
-    from gknet.inference.load import load_estimator, shipped_folder
-
-    if (spacecraft is None) == (model is None):
-        raise GknetError("give either --spacecraft NAME (a shipped model) or --model FOLDER")
-    if threads is not None and threads < 1:
-        raise GknetError(f"--threads: expected 1 or more, got {threads}")
-    return load_estimator(model or shipped_folder(spacecraft or ""), threads=threads, tta_rotations=tta_rotations)
-
-
-def predict_all(
-    source: Source, estimator: PoseEstimator, files: PredictionWriter, box: Box | None = None, oracle: bool = False
-) -> None:
-    """Every picture of the source into the files; one that cannot be read is recorded and passed over."""
-    from gknet.frame import Unreadable
-    from gknet.io.progress import progress
-
-    with progress() as bar:
-        for picture in bar.track(source, total=source.count, description="poses"):
-            if isinstance(picture, Unreadable):
-                files.add_unreadable(picture)
-                continue
-            if picture.image is None:
-                raise GknetError(f"{picture.name}: the picture came without its image")
-            if oracle:
-                if picture.cam_from_body is None:
-                    raise GknetError("--oracle: expected a dataset with true poses; give --box, or let it be found")
-                box = picture.true_box(estimator.spacecraft.points_m)
-            files.add(picture, estimator.estimate(picture.image, picture.camera, box))
+def _camera_words(
+    camera: Path | None, focal_px: float | None, hfov_deg: float | None, size: str | None, scale: bool
+) -> str:
+    """The camera options for the record of the run."""
+    given = {
+        "--camera": None if camera is None else camera.absolute(),
+        "--focal-px": focal_px,
+        "--hfov-deg": hfov_deg,
+        "--camera-size": size,
+        "--scale-camera": scale or None,
+    }
+    return " ".join(f"{option} {value}" for option, value in given.items() if value is not None)
 
 
-def tell(files: PredictionWriter) -> None:
+def print_summary(writer: PredictionWriter) -> None:
     """The summary on standard output; GknetError when no picture gave a pose."""
     from gknet.frame import AMBIGUOUS_BELOW
 
-    failures = files.failures
-    if files.pose_count == 0:
+    failures = writer.failures
+    for sentence in writer.losses:
+        print_warning(sentence)
+    if writer.pose_count == 0:
         first = f"; the first, {failures[0].name}: {failures[0].failure}" if failures else ""
-        raise GknetError(f"no pose in any of {files.count} pictures{first}")
-    typer.echo(f"{files.pose_count} of {files.count} pictures have a pose, {len(failures)} failed")
-    if files.ambiguous_count:
-        typer.echo(
-            f"  {files.ambiguous_count} of the poses may be a twin's: attitude_confidence is below {AMBIGUOUS_BELOW}"
+        raise GknetError(f"no pose in any of {writer.count} pictures{first}")
+    kept = f", {writer.kept_count} of them from an earlier run" if writer.kept_count else ""
+    print_line(f"{writer.pose_count} of {writer.count} pictures have a pose, {len(failures)} failed{kept}")
+    if writer.ambiguous_count:
+        print_line(
+            f"  {writer.ambiguous_count} of the poses may be that of a symmetric counterpart: "
+            f"attitude_confidence is below {AMBIGUOUS_BELOW}"
         )
     for failure in failures[:_SHOWN_FAILURES]:
-        typer.echo(f"  {failure.name}: {failure.failure}")
+        print_line(f"  {failure.name}: {failure.failure}")
     if len(failures) > _SHOWN_FAILURES:
-        typer.echo(f"  and {len(failures) - _SHOWN_FAILURES} more, in {files.poses_path}")
-    for path in (files.poses_path, files.overlay_folder, files.video_path):
-        if path is not None:
-            typer.echo(f"wrote {path}")
+        print_line(f"  and {len(failures) - _SHOWN_FAILURES} more, in {writer.poses_path}")
+    for path in (writer.poses_path, writer.overlay_folder, writer.video_path):
+        if path is not None and path.exists():
+            print_line(f"wrote {path}")

@@ -7,9 +7,11 @@ left behind never stands in anybody's way.
 from __future__ import annotations
 
 import os
+import re
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _NAME_CHARACTERS = 40
@@ -17,7 +19,9 @@ _NAME_CHARACTERS = 40
 
 
 @contextmanager
-def replacing(path: str | Path, keep_suffix: bool = False, keep_on_error: bool = False) -> Iterator[Path]:
+def replacing(
+    path: str | Path, keep_suffix: bool = False, keep_on_error: Callable[[], bool] = lambda: False
+) -> Iterator[Path]:
     """A temporary file beside `path` that takes its place when the `with` block ends.
 
         with replacing(path) as temporary:
@@ -26,7 +30,8 @@ def replacing(path: str | Path, keep_suffix: bool = False, keep_on_error: bool =
     Args:
         path: The file to write. Its folder exists; a file of that name is replaced.
         keep_suffix: End the temporary name as `path` ends, for writers that choose a format by the suffix.
-        keep_on_error: Rename the file too when the block ends with an exception. Without it the file is removed then.
+        keep_on_error: Called when the block ends with an exception: whether the file is renamed then too. Otherwise it
+            is removed.
 
     Yields:
         The path of an empty file with the permissions that the process's umask gives.
@@ -43,7 +48,7 @@ def replacing(path: str | Path, keep_suffix: bool = False, keep_on_error: bool =
         with naming(path, temporary):
             yield temporary
     except BaseException:
-        if keep_on_error:
+        if keep_on_error():
             _rename(temporary, path)
         else:
             temporary.unlink(missing_ok=True)
@@ -58,6 +63,39 @@ def _rename(temporary: Path, path: Path) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def stale_temporaries(folder: str | Path, name: str | None = None) -> list[Path]:
+    """Temporary files in a folder that killed writers left behind.
+
+    Args:
+        folder: Where to look, not in its sub-folders. The caller holds the folder's lock; without it a file may belong
+            to a writer at work.
+        name: Only those for a file of this name.
+    """
+    start = "" if name is None else re.escape(name[:_NAME_CHARACTERS])
+    pattern = re.compile(rf"\.{start}{'.*' if name is None else ''}\.[0-9a-f]{{16}}\.tmp(\.\w+)?", re.DOTALL)
+    return sorted(path for path in Path(folder).glob(".*") if pattern.fullmatch(path.name) and path.is_file())
+
+
+@contextmanager
+def output_folder(folder: str | Path) -> Iterator[Path]:
+    """A folder to write into, made where it is absent; one that it made is removed again when it stays empty.
+
+    Raises:
+        OSError: The folder cannot be made, or no file can be written into it. Better now than after an hour.
+    """
+    folder = Path(folder)
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with naming(folder), tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+        yield folder
+    finally:
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager

@@ -31,11 +31,15 @@ class Interrupted(KeyboardInterrupt):
 
     Attributes:
         signal_number: SIGINT, SIGTERM or SIGHUP.
+        detail: What was kept and how to go on, for the line that ends the command; it may be empty.
     """
 
-    def __init__(self, signal_number: int = signal.SIGINT) -> None:
-        super().__init__(signal_number)
-        self.signal_number = signal_number
+    def __init__(self, signal_number: int = signal.SIGINT, detail: str = "") -> None:
+        super().__init__(signal_number, detail)
+        self.signal_number, self.detail = signal_number, detail
+
+    def __str__(self) -> str:
+        return f"interrupted; {self.detail}" if self.detail else "interrupted"
 
     @property
     def exit_code(self) -> int:
@@ -59,10 +63,10 @@ class Interruption:
         """Whether a stop signal came."""
         return self._signal_number is not None
 
-    def raise_if_requested(self) -> None:
-        """Raise `Interrupted` when a stop signal came."""
+    def raise_if_requested(self, detail: str = "") -> None:
+        """Raise `Interrupted`, with its `detail`, when a stop signal came."""
         if self._signal_number is not None:
-            raise Interrupted(self._signal_number)
+            raise Interrupted(self._signal_number, detail)
 
     def _note(self, signal_number: int, frame: FrameType | None) -> None:
         if self._signal_number is not None:

@@ -27,20 +27,40 @@ TEXT_LIMIT_BYTES = 256 * 2**20
 QUOTED_CHARACTERS = 80
 _LARGEST_INTEGER = 2**64
 _BIDIRECTIONAL = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+_LINE_ENDS = frozenset("\u2028\u2029")
 
 
 def printable(text: object) -> str:
     """A name from outside as text that a terminal, a picture and UTF-8 can take.
 
-    Control characters (ESC among them), marks that turn the direction of writing and lone surrogates (a file name that
-    is not UTF-8) become backslash escapes, so that two names that differ stay apart. Everything else is kept.
+    Control characters (ESC among them), line ends, marks that turn the direction of writing and lone surrogates (a file
+    name that is not UTF-8) become backslash escapes. Everything else is kept.
     """
     return "".join(_escaped(character) if _is_unprintable(character) else character for character in str(text))
 
 
+def writable(text: str) -> str:
+    """A name from outside as text that UTF-8 can take: lone surrogates become the escapes that `printable` gives."""
+    return "".join(_escaped(character) if _is_surrogate(character) else character for character in text)
+
+
+def spreadsheet_text(text: str) -> str:
+    """A text as a cell of a CSV file: `printable`, and no formula for a spreadsheet.
+
+    A text that a spreadsheet would compute (it begins with =, +, - or @) gets an apostrophe in front, which means text;
+    so does one that begins with an apostrophe, so that taking one away is the way back.
+    """
+    shown = printable(text)
+    return f"'{shown}" if shown.startswith(("=", "+", "-", "@", "'")) else shown
+
+
 def _is_unprintable(character: str) -> bool:
     code = ord(character)
-    return code < 0x20 or 0x7F <= code < 0xA0 or 0xD800 <= code < 0xE000 or character in _BIDIRECTIONAL
+    return code < 0x20 or 0x7F <= code < 0xA0 or _is_surrogate(character) or character in _BIDIRECTIONAL | _LINE_ENDS
+
+
+def _is_surrogate(character: str) -> bool:
+    return 0xD800 <= ord(character) < 0xE000
 
 
 def _escaped(character: str) -> str:

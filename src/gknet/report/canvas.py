@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from gknet.io.text import printable
 from gknet.report.palette import INK, RGB, WHITE
 
 _SHIFT = 4
@@ -116,14 +117,14 @@ class Canvas:
     def text_width(self, text: str, size: float, weight: int = 500) -> float:
         """Width of a line of text in image pixels."""
         pixels = round(size * self.unit)
-        return cv2.getTextSize((0, 0), text, (0, 0), self._font, pixels, weight)[2]
+        return cv2.getTextSize((0, 0), printable(text), (0, 0), self._font, pixels, weight)[2]
 
     def text(
         self, text: str, corner: Float[ndarray, "2"], colour: RGB = WHITE, size: float = 20, weight: int = 500
     ) -> None:
         """A line of text with its baseline's left end at `corner`, in image pixels of the enlarged image."""
         origin = (round(float(corner[0])), round(float(corner[1])))
-        cv2.putText(self.image, text, origin, colour, self._font, round(size * self.unit), weight)
+        cv2.putText(self.image, printable(text), origin, colour, self._font, round(size * self.unit), weight)
 
     def label(self, text: str, centre: Float[ndarray, "2"], colour: RGB, size: float = 20) -> None:
         """Short outlined text centred on a point of the image."""

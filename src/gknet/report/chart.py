@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib import resources
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gknet.errors import GknetError
+from gknet.report.markup import escaped
 
 _WIDTH, _HEIGHT = 560, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 14, 34, 50
@@ -89,7 +89,7 @@ def bar_chart(title: str, value: Axis, names: Sequence[str], series: Sequence[Se
     for row, name in enumerate(names):
         top = _TOP + group * row + 4
         middle = top + thick * len(series) / 2 + 4
-        parts.append(f'<text x="{left - 7:.1f}" y="{middle:.1f}" text-anchor="end">{escape(name)}</text>')
+        parts.append(f'<text x="{left - 7:.1f}" y="{middle:.1f}" text-anchor="end">{escaped(name)}</text>')
         parts += [_bar(k, s, row, across, top + k * thick, thick - 1.5) for k, s in enumerate(series)]
     return _svg(title, "".join(parts), height)
 
@@ -106,14 +106,14 @@ def page_style() -> str:
 
 
 def empty_chart(title: str, note: str) -> str:
-    middle = f'<text x="{_WIDTH / 2}" y="90" text-anchor="middle" class="quiet">{escape(note)}</text>'
+    middle = f'<text x="{_WIDTH / 2}" y="90" text-anchor="middle" class="quiet">{escaped(note)}</text>'
     return _svg(title, middle, 150)
 
 
 def _svg(title: str, content: str, height: int) -> str:
-    heading = f'<text x="{_LEFT - 52}" y="18" class="heading">{escape(title)}</text>'
+    heading = f'<text x="{_LEFT - 52}" y="18" class="heading">{escaped(title)}</text>'
     return (
-        f'<svg class="chart" viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(title)}">'
+        f'<svg class="chart" viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escaped(title)}">'
         f"{heading}{content}</svg>"
     )
 
@@ -163,7 +163,7 @@ def _frame(across: _Scale, up: _Scale) -> str:
         parts.append(f'<text x="{_LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{_tick_text(tick)}</text>')
     middle = (_TOP + _HEIGHT - _BOTTOM) / 2
     turn = f'transform="rotate(-90 16 {middle})"'
-    parts.append(f'<text x="16" y="{middle}" text-anchor="middle" {turn}>{escape(up.axis.label)}</text>')
+    parts.append(f'<text x="16" y="{middle}" text-anchor="middle" {turn}>{escaped(up.axis.label)}</text>')
     return "".join(parts)
 
 
@@ -175,7 +175,7 @@ def _vertical_grid(across: _Scale, top: float, bottom: float) -> str:
         parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{_tick_text(tick)}</text>')
     parts.append(f'<line class="axis" x1="{across.start:.1f}" x2="{across.end:.1f}" y1="{bottom}" y2="{bottom}"/>')
     middle = (across.start + across.end) / 2
-    parts.append(f'<text x="{middle:.1f}" y="{bottom + 36}" text-anchor="middle">{escape(across.axis.label)}</text>')
+    parts.append(f'<text x="{middle:.1f}" y="{bottom + 36}" text-anchor="middle">{escaped(across.axis.label)}</text>')
     return "".join(parts)
 
 
@@ -186,7 +186,7 @@ def _legend(names: Sequence[str]) -> str:
     for k in reversed(range(len(names))):
         if not names[k]:
             continue
-        parts.append(f'<text x="{x:.1f}" y="18" text-anchor="end">{escape(names[k])}</text>')
+        parts.append(f'<text x="{x:.1f}" y="18" text-anchor="end">{escaped(names[k])}</text>')
         x -= _CHARACTER * len(names[k]) + 8
         parts.append(f'<rect class="fill s{k}" x="{x - 12:.1f}" y="9" width="12" height="9" rx="2"/>')
         x -= 26

@@ -70,7 +70,7 @@ def _picture(case: Case, dataset: SkdDataset, spacecraft: Spacecraft) -> Gallery
     if found.phase_angle_rad is not None:
         words.append(f"phase {math.degrees(found.phase_angle_rad):.0f}°")
     if found.visible_fraction is not None:
-        words.append(f"{100 * found.visible_fraction:.0f} % of keypoints seen")
+        words.append(f"{100 * found.visible_fraction:.0f} % of keypoints visible")
     if found.failure is not None:
         words.append(f"no pose: {found.failure}")
     else:

@@ -21,7 +21,8 @@ _AXES: tuple[tuple[str, RGB], ...] = (("X", VERMILLION), ("Y", GREEN), ("Z", BLU
 _AXIS_LENGTH = 0.28
 """Of the spacecraft's diameter."""
 
-_UNSEEN_SCORE = 0.05
+_NAME_CHARACTERS = 60
+_LEAST_SCORE = 0.05
 """A keypoint below has no place of its own, and is not drawn."""
 
 
@@ -62,9 +63,9 @@ def draw_overlay(
 
 
 def describe(frame: Frame, estimate: Estimate) -> list[str]:
-    """Name, range with its standard deviation, how sure the keypoints and the attitude are; or why there is no pose."""
+    """Name, range with its standard deviation, confidence in keypoints and attitude; or why there is no pose."""
     if estimate.cam_from_body is None:
-        return [frame.name, f"no pose: {estimate.failure}"]
+        return [_short(frame.name), f"no pose: {estimate.failure}"]
     position = estimate.cam_from_body.translation_m
     range_m = float(np.linalg.norm(position))
     words = f"range {range_m:.2f} m"
@@ -72,16 +73,21 @@ def describe(frame: Frame, estimate: Estimate) -> list[str]:
         towards = position / range_m
         sigma = float(np.sqrt(max(0.0, towards @ estimate.covariance[3:, 3:] @ towards)))
         words += f" ± {sigma:.2g} m" if sigma < 0.1 else f" ± {sigma:.1f} m"
-    lines = [frame.name, words]
-    sure = confidence(estimate)
-    if sure is not None and estimate.inliers is not None:
-        lines.append(f"confidence {sure:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
+    lines = [_short(frame.name), words]
+    mean_score = confidence(estimate)
+    if mean_score is not None and estimate.inliers is not None:
+        lines.append(f"confidence {mean_score:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
     if estimate.attitude_confidence is not None:
-        doubt = ", perhaps a twin" if estimate.is_ambiguous else ""
-        lines.append(f"belief in the attitude {estimate.attitude_confidence:.2f}{doubt}")
+        ambiguous = ", ambiguous" if estimate.is_ambiguous else ""
+        lines.append(f"attitude confidence {estimate.attitude_confidence:.2f}{ambiguous}")
     if estimate.reprojection_rms_px is not None:
         lines.append(f"reprojection {estimate.reprojection_rms_px:.2f} px rms")
     return lines
+
+
+def _short(name: str) -> str:
+    """The end of a long name, which differs more between pictures than its start."""
+    return name if len(name) <= _NAME_CHARACTERS else f"...{name[-_NAME_CHARACTERS + 3 :]}"
 
 
 def confidence(estimate: Estimate) -> float | None:
@@ -129,9 +135,9 @@ def _draw_axes(canvas: Canvas, camera: Camera, pose: Pose, diameter_m: float) ->
 
 
 def _draw_keypoints(canvas: Canvas, keypoints: Keypoints, visible: ndarray | None, inliers: ndarray | None) -> None:
-    """A disc where seen, a ring where the spacecraft hides it, a cross where the pose disagrees."""
+    """A disc where visible, a ring where the spacecraft hides it, a cross where the pose disagrees."""
     for k in np.argsort(keypoints.score):
-        if keypoints.score[k] < _UNSEEN_SCORE:
+        if keypoints.score[k] < _LEAST_SCORE:
             continue
         colour = score_colour(float(keypoints.score[k]))
         if inliers is not None and not inliers[k]:
@@ -143,7 +149,7 @@ def _draw_keypoints(canvas: Canvas, keypoints: Keypoints, visible: ndarray | Non
 
 
 def _draw_box(canvas: Canvas, box: Box) -> None:
-    """The four corners only: the box is read at a glance and hides nothing."""
+    """The four corners only, which hide nothing."""
     reach = 0.14 * min(box.x1 - box.x0, box.y1 - box.y0)
     for x, towards_x in ((box.x0, reach), (box.x1, -reach)):
         for y, towards_y in ((box.y0, reach), (box.y1, -reach)):
@@ -168,7 +174,7 @@ def _draw_legend(canvas: Canvas, with_truth: bool) -> None:
     """Bottom left: the two line styles, the three marks, and the score's scale."""
     u, size = canvas.unit, 15.0
     x, y = 14 * u, canvas.image.shape[0] - 14 * u
-    entries = ["estimate", *(["truth"] if with_truth else []), "seen", "hidden", "rejected"]
+    entries = ["estimate", *(["truth"] if with_truth else []), "visible", "hidden", "rejected"]
     total = sum(canvas.text_width(entry, size) + 50 * u for entry in entries) + 150 * u
     canvas.shade(0, y - 24 * u, x + total, canvas.image.shape[0])
     f = canvas.factor
@@ -180,7 +186,7 @@ def _draw_legend(canvas: Canvas, with_truth: bool) -> None:
         elif entry == "truth":
             canvas.dashes(left, right, WHITE)
         else:
-            marks = {"seen": canvas.disc, "hidden": canvas.ring, "rejected": canvas.cross}
+            marks = {"visible": canvas.disc, "hidden": canvas.ring, "rejected": canvas.cross}
             marks[entry](middle, score_colour(0.66))
         canvas.text(entry, np.array([x + 32 * u, y]), WHITE, size, 400)
         x += canvas.text_width(entry, size) + 50 * u

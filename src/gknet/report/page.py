@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 
 from gknet import __version__
 from gknet.evaluation.evaluate import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, ProtocolRun
 from gknet.evaluation.metrics import Statistic
 from gknet.report.chart import page_style
 from gknet.report.gallery import Gallery
+from gknet.report.markup import escaped
 from gknet.report.plots import charts
 from gknet.report.table import (
     COUNT_MEANINGS,
@@ -36,26 +36,26 @@ def page(title: str, sections: Sequence[Section]) -> str:
     """The whole page; every number in its tables carries its full value in `data-value`."""
     body = "".join(_section(section) for section in sections)
     links = "".join(
-        f'<a href="#{escape(s.evaluation.spacecraft.name)}">{escape(s.evaluation.spacecraft.name)}</a>'
+        f'<a href="#{escaped(s.evaluation.spacecraft.name)}">{escaped(s.evaluation.spacecraft.name)}</a>'
         for s in sections
     )
     contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
-        f"<title>{escape(title)}</title><style>{page_style()}</style></head><body><main>"
-        f'<header><h1>{escape(title)}</h1><p class="quiet">gknet {__version__}</p>{contents}</header>'
+        f"<title>{escaped(title)}</title><style>{page_style()}</style></head><body><main>"
+        f'<header><h1>{escaped(title)}</h1><p class="quiet">gknet {__version__}</p>{contents}</header>'
         f"{body}{_glossary()}</main></body></html>\n"
     )
 
 
 def _section(section: Section) -> str:
     evaluation = section.evaluation
-    name = escape(evaluation.spacecraft.name)
+    name = escaped(evaluation.spacecraft.name)
     first = evaluation.runs[0].summary
     words = [f"{evaluation.data}: {first.frames} frames of {first.sequences} sequences"]
     words += [f"Unknown: {UNKNOWN_WORDS[column]}." for column in evaluation.unknown]
-    lines = "".join(f'<p class="quiet">{escape(line)}</p>' for line in words)
+    lines = "".join(f'<p class="quiet">{escaped(line)}</p>' for line in words)
     return (
         f'<section id="{name}"><h2>{name}</h2>{lines}'
         f"{_cards(evaluation)}{_metric_table(evaluation)}{_failures(evaluation)}"
@@ -77,11 +77,11 @@ def _cards(evaluation: Evaluation) -> str:
     if run.protocol == "detected":
         cards.append(("box IoU of 0.7 or more", percent_text(run.summary.located_07), "of frames"))
     cells = "".join(
-        f'<div class="card"><span>{escape(title)}</span><strong>{escape(value)}</strong>'
-        f"<small>{escape(unit)}</small></div>"
+        f'<div class="card"><span>{escaped(title)}</span><strong>{escaped(value)}</strong>'
+        f"<small>{escaped(unit)}</small></div>"
         for title, value, unit in cards
     )
-    return f'<p class="label">{escape(PROTOCOL_WORDS[run.protocol])}</p><div class="cards">{cells}</div>'
+    return f'<p class="label">{escaped(PROTOCOL_WORDS[run.protocol])}</p><div class="cards">{cells}</div>'
 
 
 def _short(found: Statistic | None, digits: int) -> str:
@@ -90,20 +90,19 @@ def _short(found: Statistic | None, digits: int) -> str:
 
 def _metric_table(evaluation: Evaluation) -> str:
     runs = evaluation.runs
-    top = "".join(f'<th colspan="2">{escape(PROTOCOL_WORDS[run.protocol])}</th>' for run in runs)
+    top = "".join(f'<th colspan="2">{escaped(PROTOCOL_WORDS[run.protocol])}</th>' for run in runs)
     second = "".join("<th>mean [95 % interval]</th><th>median</th>" for _ in runs)
     rows = []
     for row in ROWS:
         if not any(statistic(run, row.metric) for run in runs):
             continue
         cells = "".join(_metric_cells(run, row.metric, row.digits) for run in runs)
-        head = (
-            f'<th scope="row" title="{escape(row.meaning)}">{escape(row.title)} <small>{escape(row.unit)}</small></th>'
-        )
+        title, unit = escaped(row.title), escaped(row.unit)
+        head = f'<th scope="row" title="{escaped(row.meaning)}">{title} <small>{unit}</small></th>'
         rows.append(f"<tr>{head}{cells}</tr>")
     for title, texts in summary_rows(evaluation):
-        cells = "".join(f'<td colspan="2">{escape(text)}</td>' for text in texts)
-        rows.append(f'<tr class="count"><th scope="row">{escape(title)}</th>{cells}</tr>')
+        cells = "".join(f'<td colspan="2">{escaped(text)}</td>' for text in texts)
+        rows.append(f'<tr class="count"><th scope="row">{escaped(title)}</th>{cells}</tr>')
     return (
         f'<div class="scroll"><table><thead><tr><th rowspan="2">metric</th>{top}</tr><tr>{second}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
@@ -124,11 +123,13 @@ def _metric_cells(run: ProtocolRun, metric: str, digits: int) -> str:
 def _failures(evaluation: Evaluation) -> str:
     """Kinds of failures, with the number of frames, and frames that were passed over; nothing where all went well."""
     items = [
-        f"<li>{escape(PROTOCOL_WORDS[run.protocol])}: {count} x {escape(kind.label)}</li>"
+        f"<li>{escaped(PROTOCOL_WORDS[run.protocol])}: {count} x {escaped(kind.label)}</li>"
         for run in evaluation.runs
         for kind, count in run.summary.failures.items()
     ]
-    items += [f"<li>passed over: {escape(bad.name)}: {escape(str(bad.failure))}</li>" for bad in evaluation.passed_over]
+    items += [
+        f"<li>passed over: {escaped(bad.name)}: {escaped(str(bad.failure))}</li>" for bad in evaluation.passed_over
+    ]
     if not items:
         return ""
     return f"<details><summary>Failures and why ({len(items)} kinds)</summary><ul>{''.join(items)}</ul></details>"
@@ -136,20 +137,20 @@ def _failures(evaluation: Evaluation) -> str:
 
 def _gallery(gallery: Gallery) -> str:
     figures = "".join(
-        f'<figure><img loading="lazy" alt="{escape(picture.title)}" src="{picture.data_uri}"/>'
-        f"<figcaption><b>{escape(picture.title)}</b> {escape(picture.caption)}</figcaption></figure>"
+        f'<figure><img loading="lazy" alt="{escaped(picture.title)}" src="{picture.data_uri}"/>'
+        f"<figcaption><b>{escaped(picture.title)}</b> {escaped(picture.caption)}</figcaption></figure>"
         for picture in gallery.pictures
     )
-    return f'<h3>{escape(gallery.title)}</h3><div class="gallery">{figures}</div>'
+    return f'<h3>{escaped(gallery.title)}</h3><div class="gallery">{figures}</div>'
 
 
 def _glossary() -> str:
     meanings = [(row.title, row.meaning) for row in ROWS] + list(COUNT_MEANINGS)
-    terms = "".join(f"<dt>{escape(title)}</dt><dd>{escape(meaning)}</dd>" for title, meaning in meanings)
+    terms = "".join(f"<dt>{escaped(title)}</dt><dd>{escaped(meaning)}</dd>" for title, meaning in meanings)
     return (
         '<section><h2>How to read this</h2><p>In the pictures the estimate is <span class="estimate">blue</span>, the '
         "truth white and dashed. Keypoints are coloured by score, from vermillion (0) to pale yellow (1): a disc is "
-        "seen, a ring is hidden by the spacecraft, a cross is left out of the pose. Intervals come from a bootstrap "
+        "visible, a ring is hidden by the spacecraft, a cross is left out of the pose. Intervals come from a bootstrap "
         "over whole sequences.</p>"
         f"<dl>{terms}</dl></section>"
     )

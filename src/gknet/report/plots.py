@@ -25,7 +25,7 @@ def charts(evaluation: Evaluation) -> list[str]:
     conditions: list[tuple[str, str, str, Callable[[float], float]]] = [
         ("range_diameters", "range", "range in diameters", lambda value: value),
         ("phase_angle_rad", "phase angle", "phase angle in degrees", lambda value: float(np.degrees(value))),
-        ("visible_fraction", "visible keypoints", "part of the keypoints that is seen", lambda value: value),
+        ("visible_fraction", "visible keypoints", "share of the keypoints that is visible", lambda value: value),
     ]
     for by, words, label, unit in conditions:
         drawn.append(_by_condition(evaluation, by, f"RMSE by {words}", label, "rmse_px", "mean RMSE in px", unit))
@@ -33,8 +33,8 @@ def charts(evaluation: Evaluation) -> list[str]:
     if any(b.by == "attitude_confidence" for run in evaluation.runs for b in run.summary.bins):
         by, words, label = (
             "attitude_confidence",
-            "E_q by the belief in the attitude",
-            "belief in attitudes like the pose's",
+            "E_q by attitude confidence",
+            "attitude confidence",
         )
         drawn.append(_by_condition(evaluation, by, words, label, "e_q_rad", "mean E_q in rad", lambda value: value))
     drawn.append(_by_background(evaluation, "RMSE by background", "rmse_px", "mean RMSE in px"))
@@ -80,7 +80,7 @@ def _binned(run: ProtocolRun, by: str, metric: str, unit: Callable[[float], floa
 
 
 def _by_background(evaluation: Evaluation, title: str, metric: str, value: str) -> str:
-    """Black sky beside Earth in view; empty where the labels do not say."""
+    """Black sky beside Earth in view; empty where it is unknown."""
     series = []
     for run in evaluation.runs:
         found = {b.low > 0: b.metrics[metric] for b in run.summary.bins if b.by == "earth_in_view"}

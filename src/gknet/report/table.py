@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich.table import Table
+from rich.text import Text
 
 from gknet.evaluation.evaluate import Evaluation, ProtocolRun
 from gknet.evaluation.metrics import Statistic
+from gknet.io.text import printable
 
 
 @dataclass(frozen=True)
@@ -47,14 +49,14 @@ ROWS = (
 COUNT_MEANINGS = (
     (
         "in 68 % ellipsoid",
-        "poses whose true value lies in the ellipsoid that their covariance says holds 68 %; so 95 %",
+        "poses whose true value lies in the 68 % ellipsoid of their covariance; likewise 95 %",
     ),
     ("median time", "from the image in memory to the pose, on this machine"),
 )
 
 
 def statistic(run: ProtocolRun, metric: str) -> Statistic | None:
-    """A metric of a run; the oracle's box is the truth itself, so its overlap says nothing."""
+    """A metric of a run; the oracle's box is the truth itself, so its overlap means nothing."""
     if run.protocol == "oracle" and metric == "locator_iou":
         return None
     return run.summary.metrics.get(metric)
@@ -79,7 +81,7 @@ def percent_text(part: float | None) -> str:
 
 def metric_table(evaluation: Evaluation) -> Table:
     """Every metric, the protocols side by side; it fits a terminal of 80 columns."""
-    table = _plain_table(f"{evaluation.spacecraft.name}: {evaluation.data}")
+    table = _plain_table(printable(f"{evaluation.spacecraft.name}: {evaluation.data}"))
     table.add_column("metric", no_wrap=True)
     for run in evaluation.runs:
         table.add_column(f"{run.protocol}: mean [95 %]", justify="right", no_wrap=True)
@@ -95,7 +97,9 @@ def metric_table(evaluation: Evaluation) -> Table:
 
 
 def _plain_table(title: str) -> Table:
-    return Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    """A table without lines; rich sees no markup in its title."""
+    title_text = Text(title, style="bold")
+    return Table(title=title_text, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
 
 
 def summary_rows(evaluation: Evaluation) -> list[tuple[str, list[str]]]:
@@ -134,7 +138,7 @@ def comparison_table(evaluations: Sequence[Evaluation], title: str) -> Table:
         for run in evaluation.runs:
             found = run.summary.metrics
             table.add_row(
-                evaluation.spacecraft.name,
+                Text(printable(evaluation.spacecraft.name)),
                 run.protocol,
                 str(run.summary.frames),
                 str(failure_count(run)),

@@ -1,0 +1,127 @@
+"""Overlay pictures and the overlay film of a run. What cannot be written is counted, and costs nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from gknet.io.image import write_image
+from gknet.io.text import printable
+from gknet.io.video import VideoWriter
+
+_NAME_BYTES = 200
+"""Of a file's name, which may have 255 on most file systems."""
+
+_FORBIDDEN = re.compile(r'[/\\:*?"<>|]')
+"""Characters that a file's name cannot have on some system."""
+
+
+@dataclass
+class Losses:
+    """What could not be written.
+
+    Attributes:
+        what: What is counted, in the plural.
+        count: How many were lost.
+        first: The first one and why.
+    """
+
+    what: str
+    count: int = 0
+    first: str = ""
+
+    def note(self, name: str, error: Exception) -> None:
+        """Count one."""
+        self.first = self.first or f"{name}: {error or type(error).__name__}"
+        self.count += 1
+
+    @property
+    def sentence(self) -> str | None:
+        """For the user; None when nothing was lost."""
+        return f"{self.count} {self.what} could not be written; the first, {self.first}" if self.count else None
+
+
+@dataclass
+class OverlayNames:
+    """File names of overlays, one for each picture: two pictures of a run never share one.
+
+    The same pictures in the same order have the same names in every run.
+    """
+
+    _used: set[str] = field(default_factory=set)
+
+    def name_for(self, picture: str) -> str:
+        """The file name for a picture: folders become part of it, the suffix becomes .jpg.
+
+        Where another picture has that name, the suffix is kept before .jpg, and then a number follows.
+        """
+        whole = _FORBIDDEN.sub("_", printable(picture))
+        tries = [os.path.splitext(whole)[0], whole]
+        number = 2
+        while True:
+            stem = _short(tries.pop(0) if tries else f"{whole}-{number}")
+            if stem.casefold() not in self._used:
+                self._used.add(stem.casefold())
+                return f"{stem}.jpg"
+            number += not tries
+
+
+def _short(name: str) -> str:
+    """A name that every file system takes: of a long one a hash of the whole and its end."""
+    if len(name.encode("utf-8")) <= _NAME_BYTES:
+        return name
+    end = name.encode("utf-8")[-_NAME_BYTES + 20 :].decode("utf-8", errors="ignore")
+    return f"{hashlib.sha256(name.encode('utf-8')).hexdigest()[:12]}_{end}"
+
+
+@dataclass
+class OverlayFolder:
+    """Writes overlays/<name>.jpg."""
+
+    folder: Path
+    names: OverlayNames = field(default_factory=OverlayNames)
+    losses: Losses = field(default_factory=lambda: Losses("overlays"))
+
+    def write(self, name: str, picture: UInt8[ndarray, "h w 3"]) -> None:
+        """Write the overlay of a picture, or count it as lost."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_image(self.folder / self.names.name_for(name), picture)
+        except Exception as error:  # whatever goes wrong with an overlay costs no pose
+            self.losses.note(name, error)
+
+
+@dataclass
+class OverlayFilm:
+    """Writes overlay.mp4. A frame that the codec refuses ends the film, and what was filmed before is kept."""
+
+    path: Path
+    fps: float
+    losses: Losses = field(default_factory=lambda: Losses("frames of the film"))
+    _writer: VideoWriter | None = None
+
+    def write(self, name: str, picture: UInt8[ndarray, "h w 3"]) -> None:
+        """Append a frame, or count it as lost."""
+        try:
+            if self._writer is None:
+                self._writer = VideoWriter(self.path, self.fps).__enter__()
+            self._writer.write(picture)
+        except Exception as error:  # whatever goes wrong with the film costs no pose
+            self.losses.note(name, error)
+
+    def close(self) -> None:
+        """Complete the file; one that cannot be completed is counted as lost with all its frames."""
+        writer, self._writer = self._writer, None
+        if writer is None or writer.count == 0:
+            return
+        try:
+            writer.__exit__(None, None, None)
+        except Exception as error:
+            self.losses.note(self.path.name, error)
+            self.losses.count += writer.count - 1
