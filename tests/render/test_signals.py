@@ -20,7 +20,7 @@ pytest.importorskip("trimesh")
 from gknet.dataset.skd import SkdDataset
 from gknet.io.spacecraft_file import save_spacecraft
 from gknet.render.journal import JOURNAL
-from gknet.render.recipe import _FOLDER as RECIPE_FOLDER
+from gknet.render.recipe import RECIPE_FOLDER
 from gknet.spacecraft import Spacecraft, diameter
 from tests.render.glb import Glb, box
 from tests.render.state import VARIANT, white

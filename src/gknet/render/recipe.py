@@ -42,7 +42,7 @@ TumbleRate = Annotated[FiniteFloat, Field(gt=0, le=360)]
 TimeStep = Annotated[FiniteFloat, Field(gt=0, le=60)]
 Quality = Annotated[int, Field(ge=1, le=100)]
 SpacecraftName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=100)]
-_FOLDER = Path(__file__).parent / "recipes"
+RECIPE_FOLDER = Path(__file__).parent / "recipes"
 
 
 class _Part(BaseModel):
@@ -182,10 +182,10 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
     Raises:
         GknetError: There is no such recipe, or the file is not one.
     """
-    shipped = _FOLDER / f"{name_or_path}.toml"
-    path = shipped if shipped.parent == _FOLDER and shipped.is_file() else Path(name_or_path)
+    shipped = RECIPE_FOLDER / f"{name_or_path}.toml"
+    path = shipped if shipped.parent == RECIPE_FOLDER and shipped.is_file() else Path(name_or_path)
     if not path.exists():
-        known = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.toml")))
+        known = ", ".join(sorted(file.stem for file in RECIPE_FOLDER.glob("*.toml")))
         raise GknetError(f"recipe {name_or_path}: expected one of {known}, or a TOML file; there is no such file")
     return validated(Recipe, read_toml(path), path)
 
