@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gknet.dataset.skd import SkdDataset
+from gknet.dataset.skd import SkdDataset, open_dataset
 from gknet.dataset.skd_format import SPLITS, Annotation, row_of, sequence_name
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
 from gknet.errors import GknetError
@@ -23,6 +24,10 @@ from gknet.spacecraft import Spacecraft
 POINTS = np.array([[1.2, 0.1, -0.3], [-1.1, 0.7, 0.2], [0.3, -1.4, 0.9], [0.5, 0.4, 1.7], [-0.6, -0.8, -1.3]])
 EDGES = ((0, 1), (1, 2), (2, 3), (0, 4))
 SIZE = 96
+
+
+Written = tuple[Path, dict[tuple[int, int], Annotation]]
+"""A dataset's folder, and the truth by sequence and frame."""
 
 
 def craft(name: str, points: np.ndarray = POINTS) -> Spacecraft:
@@ -58,7 +63,7 @@ def split_of(sequence: int) -> str:
 
 
 @pytest.fixture
-def written(tmp_path: Path) -> tuple[Path, dict[tuple[int, int], Annotation]]:
+def written(tmp_path: Path) -> Written:
     """Six sequences of two spacecraft, frames 0, 2 and 5 of each."""
     random = np.random.default_rng(3)
     truth = {}
@@ -96,7 +101,7 @@ def strip_to_original(root: Path) -> None:
             image.rename(image.with_name(f"{rank + 1:06d}.jpg"))
 
 
-def test_poses_points_cameras_and_extras_come_back(written: tuple) -> None:
+def test_poses_points_cameras_and_extras_come_back(written: Written) -> None:
     root, truth = written
     dataset = SkdDataset(root, spacecraft="satellite_02")
     assert len(dataset) == 9
@@ -139,7 +144,7 @@ def test_stored_axes_are_unreals(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stored, [[64, 140, 0], [64, 0, 140], [1, 0, 0]])
 
 
-def test_original_layout_reads_without_our_extras(written: tuple) -> None:
+def test_original_layout_reads_without_our_extras(written: Written) -> None:
     root, truth = written
     pytest.importorskip("torch")
     strip_to_original(root)
@@ -157,7 +162,7 @@ def test_original_layout_reads_without_our_extras(written: tuple) -> None:
     assert dataset.spacecraft.edges == tuple(sorted(EDGES))
 
 
-def test_skeleton_json_serves_where_the_toml_is_absent(written: tuple) -> None:
+def test_skeleton_json_serves_where_the_toml_is_absent(written: Written) -> None:
     root, _ = written
     for path in (root / "spacecraft").glob("*"):
         path.unlink()
@@ -166,7 +171,7 @@ def test_skeleton_json_serves_where_the_toml_is_absent(written: tuple) -> None:
     assert spacecraft.edges == tuple(sorted(EDGES))
 
 
-def test_splits_partition_and_every_thins(written: tuple) -> None:
+def test_splits_partition_and_every_thins(written: Written) -> None:
     root, _ = written
     names = {split: {SkdDataset(root, split).sequence_of(i) for i in range(6)} for split in SPLITS}
     assert set.union(*names.values()) == {sequence_name(s) for s in range(6)}
@@ -176,7 +181,7 @@ def test_splits_partition_and_every_thins(written: tuple) -> None:
     assert [frame.name for frame in thin[:2]] == ["000001/000001", "000001/000006"]
 
 
-def test_several_spacecraft_need_a_choice(written: tuple) -> None:
+def test_several_spacecraft_need_a_choice(written: Written) -> None:
     root, _ = written
     with pytest.raises(GknetError, match=r"Satellite_01, Satellite_02"):
         _ = SkdDataset(root).spacecraft
@@ -210,7 +215,7 @@ def edit_cell(root: Path, column: str, text: str) -> None:
         ("time_s", "soon"),
     ],
 )
-def test_a_bad_cell_is_named(written: tuple, column: str, text: str) -> None:
+def test_a_bad_cell_is_named(written: Written, column: str, text: str) -> None:
     root, _ = written
     edit_cell(root, column, text)
     dataset = SkdDataset(root, "train", "satellite_01")
@@ -271,7 +276,7 @@ def lose_annotations(root: Path) -> None:
         (lose_annotations, "annotations.csv"),
     ],
 )
-def test_damaged_files_are_named(written: tuple, damage, named: str) -> None:
+def test_damaged_files_are_named(written: Written, damage, named: str) -> None:
     root, _ = written
     damage(root)
     with pytest.raises(GknetError, match=named) as caught:
@@ -279,7 +284,7 @@ def test_damaged_files_are_named(written: tuple, damage, named: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_truncated_image_is_refused(written: tuple) -> None:
+def test_a_truncated_image_is_refused(written: Written) -> None:
     root, _ = written
     path = root / "data/000001/image/000001.jpg"
     path.write_bytes(path.read_bytes()[:-200])
@@ -292,7 +297,7 @@ def test_a_truncated_image_is_refused(written: tuple) -> None:
         dataset.frame(0)
 
 
-def test_another_spacecrafts_keypoints_are_refused(written: tuple) -> None:
+def test_another_spacecrafts_keypoints_are_refused(written: Written) -> None:
     root, _ = written
     write_sequence_files(root / "data/000003", Camera.from_focal(140.0, 128, 128), craft("x", POINTS + 0.1))
     with pytest.raises(GknetError, match=r"000003/keypoints.txt"):
@@ -310,10 +315,83 @@ def test_missing_root_split_and_bad_arguments(tmp_path: Path) -> None:
         SkdDataset(tmp_path, every=0)
 
 
-def test_a_broken_skeleton_pth_is_named(written: tuple) -> None:
+def test_a_broken_skeleton_pth_is_named(written: Written) -> None:
     root, _ = written
     pytest.importorskip("torch")
     strip_to_original(root)
     (root / "data/000001/skeleton.pth").write_bytes(b"not a pickle")
     with pytest.raises(GknetError, match=r"skeleton.pth"):
         _ = SkdDataset(root, spacecraft="satellite_01").spacecraft
+
+
+@pytest.mark.parametrize("category", ["envisat", "Envisat"])
+@pytest.mark.parametrize("name", ["envisat", "Envisat"])
+def test_the_case_of_a_names_first_letter_is_the_datasets(written: Written, category: str, name: str) -> None:
+    root, _ = written
+    listing = json.loads((root / "train.json").read_text())
+    (root / "train.json").write_text(json.dumps({category: listing["Satellite_01"]}))
+    (root / "spacecraft/satellite_01.toml").rename(root / f"spacecraft/{name}.toml")
+    dataset = SkdDataset(root, "train", name)
+    assert dataset.categories == (category,)
+    assert dataset.spacecraft.keypoint_names[0] == "satellite_01_point_0"
+    assert len(open_dataset(root, replace(craft("satellite_01"), name=name), "train", every=1)) == len(dataset) == 3
+
+
+def test_the_exact_name_goes_first(written: Written) -> None:
+    root, _ = written
+    (root / "train.json").write_text(json.dumps({"Envisat": ["data/000001"], "envisat": ["data/000003"]}))
+    for name, sequence in (("Envisat", "data/000001"), ("envisat", "data/000003")):
+        assert SkdDataset(root, "train", name).sequence_of(0) == sequence
+
+
+def test_byte_order_marks_are_no_fault(written: Written) -> None:
+    root, _ = written
+    for path in root.rglob("*"):
+        if path.suffix in (".json", ".csv", ".txt", ".toml"):
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    dataset = SkdDataset(root, spacecraft="satellite_01")
+    assert dataset.spacecraft.keypoint_count == len(POINTS)
+    assert dataset.frame(0).image is not None
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "named"),
+    [
+        ("train.json", 5000 * "[" + 5000 * "]", "nested too deeply"),
+        ("train.json", f'{{"Satellite_01": {"9" * 5000}}}', "digits"),
+        ("train.json", '{"Satellite_01": ["../other/data/000001"]}', "inside of the dataset"),
+        ("train.json", '{"Satellite_01": ["/etc"]}', "inside of the dataset"),
+        ("data/000001/keypoints.txt", "1 2 3\n" * 8000, "at most"),
+        ("data/000001/keypoints.txt", "1e308 2 3\n" * 5, "keypoints"),
+        ("data/000001/skeleton.json", '{"keypoint_names": 3}', "keypoint_names"),
+        ("data/000001/skeleton.json", 5000 * "[" + 5000 * "]", "nested too deeply"),
+    ],
+)
+def test_files_beyond_all_bounds_are_one_line(written: Written, file: str, content: str, named: str) -> None:
+    root, _ = written
+    for path in (root / "spacecraft").glob("*"):
+        path.unlink()
+    (root / file).write_text(content)
+    with pytest.raises(GknetError, match=rf"{file}.*{named}") as caught:
+        _ = SkdDataset(root, "train", "satellite_01").spacecraft
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("cell", ["", "-1", "1.5", "soon", "9" * 5000])
+def test_a_frame_that_is_no_number_is_named(written: Written, cell: str) -> None:
+    root, _ = written
+    edit_cell(root, "frame", cell)
+    with pytest.raises(GknetError, match=r"annotations.csv: row 2: frame") as caught:
+        SkdDataset(root, "train", "satellite_01")
+    assert len(str(caught.value)) < 500
+
+
+def test_linked_sequences_are_followed_and_a_bad_root_is_one_line(written: Written, tmp_path: Path) -> None:
+    root, _ = written
+    (root / "data/000001").rename(tmp_path / "elsewhere")
+    (root / "data/000001").symlink_to(tmp_path / "elsewhere")
+    assert SkdDataset(root, "train", "satellite_01").frame(0).image is not None
+    for bad in ("x" * 300, "a" * 5000):
+        with pytest.raises(GknetError, match="dataset folder"):
+            SkdDataset(root / bad)

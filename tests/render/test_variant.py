@@ -40,13 +40,12 @@ def block(folder: Path) -> None:
 
 def test_home_comes_first_then_the_cache_then_the_temporary_folder(tmp_path: Path) -> None:
     own = tmp_path / "tmp" / f"gknet-{os.getuid()}"
-    expected = {tmp_path / "home": tmp_path / "home", tmp_path / "cache": tmp_path / "cache/gknet", tmp_path / "tmp": own}
-    for candidate, folder in expected.items():
+    for name, folder in (("home", tmp_path / "home"), ("cache", tmp_path / "cache/gknet"), ("tmp", own)):
         drjit_home.cache_clear()
         assert drjit_home() == folder
         assert (folder / ".drjit").is_dir()
-        shutil.rmtree(candidate)
-        candidate.touch()
+        shutil.rmtree(tmp_path / name)
+        (tmp_path / name).touch()
 
 
 def test_the_temporary_folder_is_private(tmp_path: Path) -> None:

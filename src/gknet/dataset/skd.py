@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import overload
 
 import numpy as np
 
-from gknet.dataset.skd_format import SPLITS, Annotation, annotation_from, category_of, frame_stem
+from gknet.dataset.skd_format import SPLITS, Annotation, annotation_from, frame_stem, spelled_as
 from gknet.dataset.skd_sequence import SkdSequence, read_sequence, read_skeleton
 from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.geometry import Camera
 from gknet.io.image import read_image
 from gknet.io.spacecraft_file import load_spacecraft
-from gknet.io.text import read_json
-from gknet.spacecraft import Spacecraft
+from gknet.io.text import quoted, read_json
+from gknet.spacecraft import MAX_EXTENT_M, Spacecraft
 
 SAME_POINT_M = 1e-3
 """Keypoints of one spacecraft may differ by rounding between its files, by no more than this."""
@@ -25,9 +25,17 @@ SAME_POINT_M = 1e-3
 
 @dataclass(frozen=True)
 class Extras:
-    """What SKD rows say beyond a Frame; None where the folder does not say.
+    """What the folder knows of a frame beyond its Frame; None where it does not know.
 
-    index   the frame's place in its sequence, from 0
+    Attributes:
+        index: The frame's place in its sequence, from 0.
+        category: The spacecraft as the split file spells it.
+        sequence: The sequence's folder as the split file spells it, such as data/000001.
+        image_path: The picture.
+        mask_path: The mask of the spacecraft.
+        depth_path: The depth map, in m.
+        recipe: The recipe's name, of a rendered frame.
+        seed: The seed that it was rendered with.
     """
 
     index: int
@@ -43,9 +51,19 @@ class Extras:
 class SkdDataset(Sequence[Frame]):
     """Frames in the order of the split files, sequences and rows.
 
-    split       'train', 'val' or 'test'; None reads every split there is
-    spacecraft  a name such as satellite_01; None takes all
-    every       keeps each `every`-th row of a sequence
+    Args:
+        root: The folder of train.json, val.json and test.json.
+        split: train, val or test; None reads every split there is.
+        spacecraft: A name as the split files spell it; the case of its first letter makes no difference (satellite_01
+            is Satellite_01). None takes all.
+        every: Keeps each `every`-th row of a sequence.
+
+    Attributes:
+        root: As given.
+        categories: The spacecraft's names, as the split files spell them.
+
+    Raises:
+        GknetError: The folder, a split file or a sequence cannot be read, or there is no such spacecraft.
     """
 
     def __init__(
@@ -57,11 +75,12 @@ class SkdDataset(Sequence[Frame]):
         listed = _listed_sequences(self.root, split)
         self.categories = tuple(sorted({category for category, _ in listed}))
         if spacecraft is not None:
-            listed = [(category, name) for category, name in listed if category == category_of(spacecraft)]
-            if not listed:
+            chosen = spelled_as(spacecraft, self.categories)
+            if chosen is None:
                 have = ", ".join(self.categories) or "none"
                 raise GknetError(f"{self.root}: no sequence of '{spacecraft}'; the spacecraft there are: {have}")
-            self.categories = (category_of(spacecraft),)
+            listed = [(category, name) for category, name in listed if category == chosen]
+            self.categories = (chosen,)
         self._sequences = [read_sequence(self.root, name, category) for category, name in listed]
         self._rows = [(s, r) for s in range(len(listed)) for r in range(0, len(self._sequences[s].rows), every)]
         self._sizes: dict[int, tuple[int, int]] = {}
@@ -94,7 +113,15 @@ class SkdDataset(Sequence[Frame]):
         return self._sequences[self._rows[i][0]].name
 
     def frame(self, i: int, image: bool = True) -> Frame:
-        """Frame `i`; without `image` only its labels are read."""
+        """Frame `i` of this view.
+
+        Args:
+            i: From 0.
+            image: Whether the picture is read too.
+
+        Raises:
+            GknetError: Its label or its picture is damaged.
+        """
         sequence, annotation = self._annotation(i)
         pixels = read_image(sequence.image_path(annotation.index)) if image else None
         camera = annotation.camera
@@ -118,6 +145,11 @@ class SkdDataset(Sequence[Frame]):
         )
 
     def extras(self, i: int) -> Extras:
+        """What else the folder knows of frame `i`.
+
+        Raises:
+            GknetError: Its label is damaged.
+        """
         sequence, annotation = self._annotation(i)
         stem = frame_stem(annotation.index)
         mask_path = sequence.folder / "mask" / f"{stem}.png"
@@ -159,12 +191,15 @@ def _first_size(sequence: SkdSequence) -> tuple[int, int]:
 
 def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
     """(category, data/000001) of the chosen splits."""
-    if not root.is_dir():
-        raise GknetError(f"{root}: no such dataset folder")
     if split is not None and split not in SPLITS:
         raise GknetError(f"split: expected one of {', '.join(SPLITS)}, got '{split}'")
     paths = [root / f"{name}.json" for name in ([split] if split else SPLITS)]
-    present = [path for path in paths if path.exists()]
+    try:
+        if not root.is_dir():
+            raise GknetError(f"{root}: no such dataset folder")
+        present = [path for path in paths if path.exists()]
+    except OSError as error:  # a folder above that may not be entered, a name that is too long
+        raise GknetError(f"{root}: the dataset folder cannot be read ({error.strerror})") from error
     if not present:
         raise GknetError(
             f"{root}: expected {' or '.join(path.name for path in paths)}, found none; is it an SKD folder?"
@@ -182,7 +217,11 @@ def _read_split(path: Path) -> list[tuple[str, str]]:
     lists = listing.values() if isinstance(listing, dict) else [None]
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
         raise GknetError(f'{path}: expected {{"Satellite_01": ["data/000001", ...], ...}}, got something else')
-    return [(category, name.rstrip("/")) for category, names in listing.items() for name in names]
+    listed = [(category, name.rstrip("/")) for category, names in listing.items() for name in names]
+    for _, name in listed:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise GknetError(f"{path}: expected sequences inside of the dataset's folder, got {quoted(name)}")
+    return listed
 
 
 def _spacecraft(root: Path, sequences: list[SkdSequence]) -> Spacecraft:
@@ -202,14 +241,15 @@ def _spacecraft(root: Path, sequences: list[SkdSequence]) -> Spacecraft:
 
 
 def _declared_spacecraft(root: Path, category: str) -> Spacecraft | None:
-    for path in sorted((root / "spacecraft").glob("*.toml")):
-        if category_of(path.stem) == category:
-            return load_spacecraft(path)
-    return None
+    files = {path.stem: path for path in sorted((root / "spacecraft").glob("*.toml"))}
+    stem = spelled_as(category, files)
+    return None if stem is None else load_spacecraft(files[stem])
 
 
 def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
     points = sequence.points_m
+    if np.abs(points).max() > MAX_EXTENT_M:
+        raise GknetError(f"{sequence.folder / 'keypoints.txt'}: expected keypoints within {MAX_EXTENT_M:g} m")
     span = np.linalg.norm(points[:, None] - points[None], axis=2)
     if len(points) < 4 or span.max() < SAME_POINT_M:
         raise GknetError(f"{sequence.folder / 'keypoints.txt'}: expected 4 keypoints or more, apart from each other")
@@ -225,7 +265,17 @@ def _skeleton_spacecraft(sequence: SkdSequence) -> Spacecraft:
 
 
 def open_dataset(path: Path, spacecraft: Spacecraft, split: str | None, every: int) -> SkdDataset:
-    """The frames of `spacecraft`, whose keypoints in the dataset must be the ones given."""
+    """The frames of a spacecraft, whose keypoints in the dataset must be the ones given.
+
+    Args:
+        path: The dataset's folder.
+        spacecraft: Its name chooses the frames.
+        split: train, val or test; None for all.
+        every: Keeps each `every`-th row of a sequence.
+
+    Raises:
+        GknetError: The dataset cannot be read, has no frame of the spacecraft, or has other keypoints.
+    """
     dataset = SkdDataset(path, split, spacecraft.name, every)
     if len(dataset) == 0:
         raise GknetError(f"{path}: no frame of {spacecraft.name} in {f'the split {split}' if split else 'the dataset'}")

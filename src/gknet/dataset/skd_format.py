@@ -9,6 +9,7 @@ stored quaternion; and K = K' P^T = [[cx, fx, 0], [cy, 0, fy], [1, 0, 0]] maps S
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera, Pose
+from gknet.io.text import quoted
 
 P = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Row vectors: v_opencv = v_skd @ P."""
@@ -26,20 +28,22 @@ SPLITS = ("train", "val", "test")
 AUTHORS_COLUMNS = ("category", "position", "orientation")
 OUR_COLUMNS = ("frame", "time_s", "visible", "sun_direction", "earth", "camera", "recipe", "seed")
 
-LONGEST_SHOWN = 80
-"""Characters of a bad cell that an error quotes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
     """One row of annotations.csv in our axes. None stands for a column that the file does not have.
 
-    category       the spacecraft as SKD spells it: Satellite_01
-    index          the frame's place in its sequence, from 0; its image is `index + 1`
-    visible        (n,) bool: keypoint in view and not hidden
-    sun_direction  unit vector in the camera frame
-    earth          whether the Earth is in the picture
-    recipe, seed   what the renderer made the frame from
+    Attributes:
+        category: The spacecraft as SKD spells it: Satellite_01.
+        index: The frame's place in its sequence, from 0; its image is `index + 1`.
+        cam_from_body: The pose, translation in m, in the OpenCV camera frame.
+        time_s: Since the sequence's first frame, in s.
+        visible: (n,) bool: keypoint in view and not hidden.
+        sun_direction: (3,) unit vector to the sun in the camera frame.
+        earth: Whether the Earth is in the picture.
+        camera: Of this picture, which may be a part of the full image.
+        recipe: Name of the recipe that the renderer made the frame from.
+        seed: The renderer's.
     """
 
     category: str
@@ -55,8 +59,16 @@ class Annotation:
 
 
 def category_of(spacecraft_name: str) -> str:
-    """SKD's spelling of a spacecraft's name: satellite_01 -> Satellite_01."""
+    """A spacecraft's name as SKD spells it: satellite_01 -> Satellite_01."""
     return spacecraft_name[:1].upper() + spacecraft_name[1:]
+
+
+def spelled_as(spacecraft_name: str, categories: Iterable[str]) -> str | None:
+    """The one of `categories` that is this name: spelled so, or else with the other case of the first letter."""
+    known = list(categories)
+    if spacecraft_name in known:
+        return spacecraft_name
+    return next((each for each in known if category_of(each) == category_of(spacecraft_name)), None)
 
 
 def sequence_name(sequence: int) -> str:
@@ -75,6 +87,7 @@ def to_skd_points(points_m: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
 
 
 def from_skd_points(points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
+    """Points or directions in our axes: v' = v P."""
     return np.asarray(points) @ P
 
 
@@ -84,10 +97,12 @@ def to_skd_quaternion(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "4"]:
 
 
 def from_skd_quaternion(xyzw: Float[ndarray, "4"]) -> Float[ndarray, "3 3"]:
+    """R' = P^T R P of SKD's quaternion."""
     return P.T @ Rotation.from_quat(xyzw).as_matrix() @ P
 
 
 def to_skd_matrix(matrix: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
+    """K = K' P^T, which maps SKD's camera axes to pixels."""
     return matrix @ P.T
 
 
@@ -96,7 +111,11 @@ def _list_text(values: ndarray) -> str:
 
 
 def row_of(annotation: Annotation) -> dict[str, str]:
-    """The cells of a row; it must be complete."""
+    """The cells of a row.
+
+    Raises:
+        GknetError: The camera, `visible` or the sun's direction is missing.
+    """
     pose, camera = annotation.cam_from_body, annotation.camera
     if camera is None or annotation.visible is None or annotation.sun_direction is None:
         raise GknetError(f"frame {annotation.index}: expected camera, visible and sun_direction before it is written")
@@ -116,11 +135,6 @@ def row_of(annotation: Annotation) -> dict[str, str]:
     }
 
 
-def shown(text: str) -> str:
-    """A cell in an error's words, cut when it is long."""
-    return repr(text) if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]!r}..."
-
-
 def _numbers(row: dict[str, str], column: str, count: int | None, place: str) -> Float[ndarray, " n"]:
     """The finite numbers of a cell such as "[1, 2, 3]"."""
     text = row[column]
@@ -128,9 +142,9 @@ def _numbers(row: dict[str, str], column: str, count: int | None, place: str) ->
     try:
         values = np.array(ast.literal_eval(text.strip()), dtype=float)
     except (ValueError, SyntaxError, TypeError, OverflowError, MemoryError, RecursionError) as error:
-        raise GknetError(f"{place}: {column}: expected a list of {expected}, got {shown(text)}") from error
+        raise GknetError(f"{place}: {column}: expected a list of {expected}, got {quoted(text)}") from error
     if values.ndim != 1 or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        raise GknetError(f"{place}: {column}: expected {expected}, all finite, got {shown(text)}")
+        raise GknetError(f"{place}: {column}: expected {expected}, all finite, got {quoted(text)}")
     return values
 
 
@@ -141,16 +155,16 @@ def _number(row: dict[str, str], column: str, place: str) -> float | None:
     try:
         value = float(text)
     except ValueError as error:
-        raise GknetError(f"{place}: {column}: expected a number, got {shown(text)}") from error
+        raise GknetError(f"{place}: {column}: expected a number, got {quoted(text)}") from error
     if not np.isfinite(value):
-        raise GknetError(f"{place}: {column}: expected a finite number, got {text!r}")
+        raise GknetError(f"{place}: {column}: expected a finite number, got {quoted(text)}")
     return value
 
 
 def _camera(row: dict[str, str], place: str) -> Camera:
     fx, fy, cx, cy, width, height = _numbers(row, "camera", 6, place)
     if width % 1 or height % 1:
-        raise GknetError(f"{place}: camera: expected a width and height in whole pixels, got {shown(row['camera'])}")
+        raise GknetError(f"{place}: camera: expected a width and height in whole pixels, got {quoted(row['camera'])}")
     try:
         return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height))
     except GknetError as error:
@@ -160,13 +174,23 @@ def _camera(row: dict[str, str], place: str) -> Camera:
 def _pose(row: dict[str, str], place: str) -> Pose:
     orientation = _numbers(row, "orientation", 4, place)
     if abs(np.linalg.norm(orientation) - 1) > 1e-2:
-        raise GknetError(f"{place}: orientation: expected a unit quaternion xyzw, got {row['orientation']!r}")
+        raise GknetError(f"{place}: orientation: expected a unit quaternion xyzw, got {quoted(row['orientation'])}")
     position = _numbers(row, "position", 3, place)
     return Pose(from_skd_quaternion(orientation), from_skd_points(position))
 
 
 def annotation_from(row: dict[str, str], index: int, keypoint_count: int, place: str) -> Annotation:
-    """A row in our axes; `place` names the file and the row in what errors say."""
+    """A row in our axes.
+
+    Args:
+        row: The cells as text.
+        index: The frame's place in its sequence, from 0.
+        keypoint_count: What the column `visible` must agree with.
+        place: File and row, which errors name.
+
+    Raises:
+        GknetError: A cell is not what its column holds.
+    """
     visible = sun = seed = earth = None
     if row.get("visible"):
         visible = _numbers(row, "visible", None, place) > 0.5

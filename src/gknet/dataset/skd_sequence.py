@@ -13,18 +13,26 @@ from numpy import ndarray
 
 from gknet.dataset.skd_format import AUTHORS_COLUMNS, frame_stem, from_skd_points
 from gknet.errors import GknetError
-from gknet.io.text import read_json, read_text
+from gknet.io.text import quoted, read_json, read_text
 from gknet.io.text_table import read_skd_camera_matrix, read_table
 from gknet.io.torch_file import load_torch_file
+
+MOST_DIGITS = 9
+"""Of a frame's number."""
 
 
 @dataclass(frozen=True, eq=False)
 class SkdSequence:
-    """`rows` are the cells as text, parsed when a frame is asked for; `indices` their frames, from 0.
+    """One sequence's files, read.
 
-    name           as in the split files: data/000001
-    camera_matrix  (3, 3) K in our axes, of the whole sensor
-    points_m       (n, 3) keypoints in our body axes
+    Attributes:
+        name: As in the split files: data/000001.
+        folder: Where it is.
+        category: The spacecraft as the split file spells it.
+        rows: The cells as text, parsed when a frame is asked for.
+        indices: The frame of each row, from 0.
+        camera_matrix: (3, 3) K in our axes, of the whole sensor.
+        points_m: (n, 3) keypoints in our body axes, in m.
     """
 
     name: str
@@ -41,11 +49,23 @@ class SkdSequence:
 
 @dataclass(frozen=True)
 class Skeleton:
+    """Names of the n keypoints, and pairs of their indices."""
+
     keypoint_names: tuple[str, ...]
     edges: tuple[tuple[int, int], ...]
 
 
 def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
+    """Read the labels of a sequence, not its pictures.
+
+    Args:
+        root: The dataset's folder.
+        name: Of the sequence in a split file, such as data/000001.
+        category: The spacecraft.
+
+    Raises:
+        GknetError: A file is missing or damaged.
+    """
     folder = root / name
     rows = read_rows(folder / "annotations.csv")
     own = folder / "camera_matrix.txt"
@@ -61,7 +81,11 @@ def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
 
 
 def read_rows(path: Path) -> tuple[dict[str, str], ...]:
-    """The rows of an annotations.csv as text, each with the authors' columns at least."""
+    """The rows of an annotations.csv as text, each with the authors' columns at least.
+
+    Raises:
+        GknetError: The file cannot be read, a column is missing, or a row has another number of cells.
+    """
     reader = csv.DictReader(io.StringIO(read_text(path), newline=""), skipinitialspace=True)
     try:
         rows = tuple(reader)
@@ -84,17 +108,22 @@ def _indices(folder: Path, rows: tuple[dict[str, str], ...]) -> tuple[int, ...]:
     path = folder / "annotations.csv"
     if rows and "frame" in rows[0]:
         for number, row in enumerate(rows, start=1):
-            if not row["frame"].strip().isdecimal():
-                raise GknetError(f"{path}: row {number}: frame: expected 0, 1, ..., got {row['frame']!r}")
+            if not row["frame"].strip().isdecimal() or len(row["frame"].strip()) > MOST_DIGITS:
+                raise GknetError(f"{path}: row {number}: frame: expected 0, 1, ..., got {quoted(row['frame'])}")
         return tuple(int(row["frame"]) for row in rows)
-    last = max((path.stem for path in (folder / "image").glob("*.jpg") if path.stem.isdecimal()), key=int, default="0")
+    stems = [path.stem for path in (folder / "image").glob("*.jpg")]
+    last = max((stem for stem in stems if stem.isdecimal() and len(stem) <= MOST_DIGITS), key=int, default="0")
     if int(last) > len(rows):
         raise GknetError(f"{path}: {len(rows)} rows, yet there is an image {last}; add a column 'frame' (from 0)")
     return tuple(range(len(rows)))
 
 
 def read_skeleton(folder: Path, keypoint_count: int) -> Skeleton:
-    """skeleton.json, else the authors' skeleton.pth, whose keypoints have no names."""
+    """skeleton.json, else the authors' skeleton.pth, whose keypoints have no names.
+
+    Raises:
+        GknetError: Neither is there, or it is not the skeleton of so many keypoints.
+    """
     path = folder / "skeleton.json"
     if path.exists():
         return _read_json_skeleton(path, keypoint_count)
@@ -123,5 +152,5 @@ def _edges(path: Path, edges: object, keypoint_count: int) -> tuple[tuple[int, i
         raise GknetError(f"{path}: expected a list of pairs of keypoint indices") from error
     for i, j in pairs:
         if not (0 <= i < keypoint_count and 0 <= j < keypoint_count and i != j):
-            raise GknetError(f"{path}: edge ({i}, {j}) is no pair of the keypoints 0 to {keypoint_count - 1}")
+            raise GknetError(f"{path}: edge {quoted((i, j))} is no pair of the keypoints 0 to {keypoint_count - 1}")
     return pairs

@@ -33,11 +33,12 @@ def _matrix_text(matrix: ndarray) -> str:
 
 
 def write_camera_matrix(path: Path, camera: Camera) -> None:
+    """K in SKD's axes as a camera_matrix.txt."""
     write_text(path, _matrix_text(to_skd_matrix(camera.matrix)))
 
 
 def _write_torch_skeleton(path: Path, edges: list[tuple[int, int]]) -> None:
-    """The authors' pickle, where torch is installed; skeleton.json says the same to everybody else."""
+    """The authors' pickle, where torch is installed; skeleton.json has the same content without it."""
     try:
         import torch
     except ImportError:
@@ -48,9 +49,12 @@ def _write_torch_skeleton(path: Path, edges: list[tuple[int, int]]) -> None:
 
 
 def write_sequence_files(folder: Path, camera: Camera, spacecraft: Spacecraft) -> None:
-    """camera_matrix.txt, keypoints.txt and the skeleton of a sequence.
+    """Write camera_matrix.txt, keypoints.txt and the skeleton of a sequence.
 
-    `camera` is the whole sensor's. Frames that are cut-outs have their own in the `camera` column.
+    Args:
+        folder: The sequence's, made where it is missing.
+        camera: The whole sensor's. Frames that are cut-outs have their own in the `camera` column.
+        spacecraft: Its keypoints and edges.
     """
     folder.mkdir(parents=True, exist_ok=True)
     edges = [(int(i), int(j)) for i, j in spacecraft.edges]
@@ -65,7 +69,7 @@ def write_sequence_files(folder: Path, camera: Camera, spacecraft: Spacecraft) -
 
 
 def write_annotations(folder: Path, rows: Iterable[dict[str, str]]) -> None:
-    """annotations.csv, in the order of the frames."""
+    """Write annotations.csv, in the order of the frames."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [*AUTHORS_COLUMNS, *OUR_COLUMNS], lineterminator="\n")
     writer.writeheader()
@@ -76,7 +80,16 @@ def write_annotations(folder: Path, rows: Iterable[dict[str, str]]) -> None:
 def write_frame_files(
     folder: Path, index: int, rgb: ndarray, quality: int, mask: ndarray | None, depth_m: ndarray | None
 ) -> None:
-    """image/000001.jpg, and where given mask/000001.png and depth/000001.npz (`depth_m` float32, 0 = nothing)."""
+    """Write image/000001.jpg, and where given mask/000001.png and depth/000001.npz.
+
+    Args:
+        folder: The sequence's.
+        index: The frame's place in it, from 0.
+        rgb: (h, w, 3) uint8.
+        quality: JPEG's, 1 to 100.
+        mask: (h, w) bool.
+        depth_m: (h, w) z in the camera frame in m, 0 where there is nothing; written as float32.
+    """
     stem = frame_stem(index)
     if mask is not None:
         write_mask(_made(folder / "mask") / f"{stem}.png", mask)
@@ -100,9 +113,9 @@ def sequences_on_disk(root: Path) -> list[int]:
 
 
 def write_splits(root: Path, split_of: Callable[[int], str], spacecraft_of: Callable[[int], str]) -> None:
-    """train.json, val.json and test.json from the sequences on disk.
+    """Write train.json, val.json and test.json from the sequences on disk.
 
-    Several writers may share a root: each looks again after writing, so the last one to write has seen them all.
+    Several writers may share a root: each lists the sequences again after writing, so the last one lists them all.
     """
     present: list[int] | None = None
     while present != (found := sequences_on_disk(root)):
