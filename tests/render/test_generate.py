@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -110,15 +112,15 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "load_mesh", lambda spacecraft: [])
 
 
-def run(out: Path, **options: Any) -> stage.Generated:
-    """Render with options and a selection by name."""
-    chosen: dict[str, Any] = {"seed": 5, "size": 64} | options
-    by_class = [
-        {field.name: chosen.pop(field.name) for field in fields(kind) if field.name in chosen}
+def run(out: Path, **values: Any) -> stage.Generated:
+    """Render with the options, the selection and the other arguments that have these names."""
+    given: dict[str, Any] = {"seed": 5, "size": 64} | values
+    options, selection = (
+        kind(**{field.name: given.pop(field.name) for field in fields(kind) if field.name in given})
         for kind in (Options, Selection)
-    ]
-    rest = {"recipe": recipe(), "workers": 1, "variant": "scalar_rgb"} | chosen
-    return stage.generate(out=out, options=Options(**by_class[0]), selection=Selection(**by_class[1]), **rest)
+    )
+    rest: dict[str, Any] = {"recipe": recipe(), "workers": 1, "variant": "scalar_rgb"} | given
+    return stage.generate(out=out, options=options, selection=selection, **rest)
 
 
 def everything(root: Path) -> dict[str, bytes]:
@@ -272,7 +274,10 @@ def test_bad_selections_are_named(selection: dict) -> None:
         plan_sequences(recipe(), Selection(**selection))
 
 
-@pytest.mark.parametrize("option", [{"window": "crop"}, {"size": 4}, {"spp": 0}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "option",
+    [{"window": "crop"}, {"size": 4}, {"size": 9000}, {"spp": 0}, {"spp": 10**6}, {"seed": -1}, {"seed": 2**60}],
+)
 def test_bad_options_are_named(option: dict) -> None:
     good = Options(size=64, spp=4)
     with pytest.raises(GknetError, match=next(iter(option))):
@@ -325,3 +330,117 @@ def test_a_reader_of_the_authors_rules_finds_the_keypoints_in_our_pictures(tmp_p
                 assert image[int(y), int(x)].min() > 200
                 seen += 1
     assert seen > 100
+
+
+DAMAGES: dict[str, Callable[[str], str]] = {
+    "cut": lambda line: line[:-30],
+    "no JSON": lambda line: line.replace('"', "'"),
+    "a list": lambda line: f"[{line}]",
+    "nested": lambda line: 5000 * "[" + 5000 * "]",
+    "digits": lambda line: line.replace('"frame": "1"', f'"frame": {"9" * 5000}'),
+    "another key": lambda line: line.replace('"time_s"', '"clock"'),
+    "one key more": lambda line: line.replace("{", '{"more": "1", ', 1),
+    "a number": lambda line: line.replace('"frame": "1"', '"frame": 1'),
+    "another frame": lambda line: line.replace('"frame": "1"', '"frame": "6"'),
+    "a frame of many digits": lambda line: line.replace('"frame": "1"', f'"frame": "{"9" * 5000}"'),
+    "no pose": lambda line: line.replace('"position": "[', '"position": "[x'),
+    "no camera": lambda line: re.sub(r'"camera": "[^"]*"', '"camera": ""', line),
+    "flags": lambda line: re.sub(r'"visible": "[^"]*"', '"visible": "[1]"', line),
+    "bytes": lambda line: line.replace("position", "posi\udcfftion"),
+    "nothing": lambda line: "",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_the_frame_of_a_damaged_line_is_rendered_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    selection: dict[str, Any] = {"sequences": 1, "spacecraft": ("satellite_01",), "frames": 4}
+    run(tmp_path / "whole", **selection)
+    with monkeypatch.context() as context:
+        context.setattr(stage, "finish", lambda *_: None)
+        run(tmp_path / "cut", **selection)
+    journal = tmp_path / "cut/data/000001" / JOURNAL
+    lines = journal.read_text(encoding="utf-8").splitlines()
+    [place] = [k for k, line in enumerate(lines) if '"frame": "1"' in line]
+    lines[place] = DAMAGES[damage](lines[place])
+    journal.write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
+    result = run(tmp_path / "cut", **selection)
+    assert (result.kept, result.rendered) == (3, 1)
+    assert everything(tmp_path / "cut") == everything(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"{}",
+        b"null",
+        b"\xff\xfe",
+        b"5" * 5000,
+        b"[" * 5000 + b"]" * 5000,
+        b'{"seed": ' + b"9" * 401 + b"}",
+        b" " * (2 << 20),
+    ],
+)
+def test_a_damaged_recipe_json_is_one_line(tmp_path: Path, content: bytes) -> None:
+    run(tmp_path, sequences=1, frames=1)
+    (tmp_path / "recipe.json").write_bytes(content)
+    with pytest.raises(GknetError, match=r"recipe\.json.*choose another folder") as caught:
+        run(tmp_path, sequences=1, frames=1)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+def test_damaged_annotations_are_one_line(tmp_path: Path) -> None:
+    run(tmp_path, sequences=1, frames=2, spacecraft=("satellite_01",))
+    table = tmp_path / "data/000001/annotations.csv"
+    good = table.read_text(encoding="utf-8")
+    for bad in (
+        "",
+        "a,b\n",
+        good.replace("visible", "seen"),
+        good[:-200],
+        good.replace("Satellite_01", "x,Satellite_01"),
+    ):
+        table.write_text(bad, encoding="utf-8")
+        with pytest.raises(GknetError, match=r"annotations\.csv") as caught:
+            run(tmp_path, sequences=1, frames=2, spacecraft=("satellite_01",))
+        assert "\n" not in str(caught.value)
+    table.unlink()
+    assert run(tmp_path, sequences=1, frames=2, spacecraft=("satellite_01",)).rendered == 2
+
+
+def test_an_own_spacecraft_is_rendered_by_its_name(tmp_path: Path) -> None:
+    """Its files are put into the folder beforehand; capitals make no difference."""
+    (tmp_path / "spacecraft").mkdir()
+    built("Envisat", tmp_path / "spacecraft")
+    own = recipe().model_copy(update={"spacecraft": ("Envisat", "satellite_01")})
+    run(tmp_path, recipe=own, sequences=1, frames=1, spacecraft=("envisat",))
+    assert SkdDataset(tmp_path).categories == ("Envisat",)
+
+
+@pytest.mark.parametrize("workers", [0, -1, 100_000])
+def test_workers_are_bounded(tmp_path: Path, workers: int) -> None:
+    with pytest.raises(GknetError, match="workers: expected 1 to 256"):
+        run(tmp_path, workers=workers)
+
+
+def test_a_mesh_of_another_scale_ends_the_job_before_its_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(spacecraft: Spacecraft) -> None:
+        raise GknetError(f"{spacecraft.name}: is the mesh in millimetres?")
+
+    monkeypatch.setattr(stage, "load_mesh", refuse)
+    with pytest.raises(GknetError, match="millimetres"):
+        run(tmp_path, sequences=1)
+    assert not list(tmp_path.rglob("*.jpg"))
+
+
+def test_progress_is_reported_from_start_to_end(tmp_path: Path) -> None:
+    seen: list[stage.Progress] = []
+    run(tmp_path, sequences=1, frames=2, on_progress=seen.append)
+    assert [(each.done, each.total) for each in seen] == [(0, 6), (2, 6), (4, 6), (6, 6)]
