@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import cv2
 import numpy as np
@@ -286,6 +289,26 @@ def test_a_live_source_is_bounded(source: int | str, monkeypatch: pytest.MonkeyP
     assert times == sorted(times)
     assert len(list(LiveVideo(source, 25, 1000).frames())) == 20
     assert given == [source] * 3
+
+
+def test_a_stream_over_http(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("http_proxy", raising=False)
+    written(tmp_path / "a.mp4", count=6)
+    handler = partial(QuietHandler, directory=str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        video = open_live(f"http://127.0.0.1:{server.server_port}/a.mp4", limit=100)
+        frames = list(video.frames())
+        server.shutdown()
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert video.fps == 10
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder and prints nothing."""
+
+    def log_message(self, *arguments: object) -> None:
+        pass
 
 
 def test_a_stream_that_is_not_there() -> None:

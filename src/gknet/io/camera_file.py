@@ -25,8 +25,6 @@ from gknet.io.camera_colmap import from_colmap, is_colmap
 from gknet.io.camera_json import from_json
 from gknet.io.camera_opencv import from_xml
 from gknet.io.camera_yaml import from_yaml
-from gknet.io.lens import FieldOfView as FieldOfView  # until its importers follow
-from gknet.io.lens import Lens as Lens
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import parse_json, read_text
 from gknet.io.text_table import parse_table, skd_camera_matrix

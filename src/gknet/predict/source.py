@@ -41,7 +41,13 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """Image files seen through one lens. Of a file with several pages the first is read, and the rest is reported."""
+    """Image files seen through one lens. Of a file with several pages the first is read, and the rest is reported.
+
+    Attributes:
+        files: what `find_files` found; a file that cannot be read is reported.
+        lens: gives each picture the camera of its size.
+        bit_depth: see `gknet.io.image.read_image_file`.
+    """
 
     files: tuple[Found, ...]
     lens: Lens
@@ -75,7 +81,14 @@ class ImageFiles:
 
 @dataclass(frozen=True)
 class VideoFile:
-    """Every `every`-th frame of a video, by the name <video>/<index>. One that cannot be decoded keeps its index."""
+    """Every `every`-th frame of a video, by the name <video>/<index>. One that cannot be decoded keeps its index.
+
+    Attributes:
+        video: the file.
+        lens: gives the frames their camera.
+        every: take each n-th frame.
+        name: of the video; that of its file without the suffix by default.
+    """
 
     video: Video
     lens: Lens
@@ -103,7 +116,14 @@ class VideoFile:
 
 @dataclass(frozen=True)
 class LiveFrames:
-    """Every `every`-th frame of a camera or a stream."""
+    """Every `every`-th frame of a camera or a stream, by the name <source>/<index>.
+
+    Attributes:
+        video: the camera or stream.
+        lens: gives the frames their camera.
+        every: take each n-th frame.
+        name: of the source.
+    """
 
     video: LiveVideo
     lens: Lens
