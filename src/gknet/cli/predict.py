@@ -39,7 +39,11 @@ class PoseLayout(StrEnum):
 def predict(
     inputs: Annotated[
         list[str],
-        typer.Argument(metavar="INPUT...", help="Images, folders of images, videos, or an SKD dataset."),
+        typer.Argument(
+            metavar="INPUT...",
+            help="Images, videos, folders of them, patterns, lists (@list.txt), a camera's number, a stream's URL; "
+            "or an SKD dataset.",
+        ),
     ],
     spacecraft: SpacecraftOption = None,
     model: ModelOption = None,
@@ -58,6 +62,10 @@ def predict(
     oracle: Annotated[bool, typer.Option("--oracle", help="Take the box from a dataset's labels.")] = False,
     split: Annotated[str | None, typer.Option(help="Of a dataset: train, val or test.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Take each n-th picture.")] = 1,
+    bit_depth: Annotated[
+        int | None, typer.Option(min=9, max=16, help="Of images of more than 8 bits that do not state it.")
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Frames of a camera or a stream to read at most.")] = 100_000,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("predictions"),
     resume: Annotated[bool, typer.Option("--resume", help="Keep the poses that are in --out, and go on.")] = False,
     overwrite: Annotated[
@@ -88,10 +96,7 @@ def predict(
     folder = model_folder(spacecraft, model)
     lens = choose_lens(camera, focal_px, hfov_deg, parse_size(camera_size), scale_camera)
     estimator = open_estimator(folder, threads, device, tta_rotations)
-    checked_inputs(inputs)
-    if len(inputs) > 1:
-        raise GknetError(f"INPUT: expected one, got {len(inputs)}")
-    source = open_source(inputs[0], lens, estimator.spacecraft, split, every)
+    source = open_source(inputs, lens, estimator.spacecraft, split, every, bit_depth, limit)
     record = RunRecord(
         inputs=tuple(str(Path(text).absolute()) if Path(text).exists() else text for text in inputs),
         model=str(folder.absolute()),
@@ -100,6 +105,7 @@ def predict(
         oracle=oracle,
         split=split,
         every=every,
+        bit_depth=bit_depth,
         tta_rotations=tta_rotations,
     )
     fps = (source.fps or STILLS_FPS) if video else None
@@ -109,13 +115,6 @@ def predict(
         pictures = bar.track(source, total=source.count, description="poses")
         predict_all(pictures, estimator, writer, given_box, oracle)
     print_summary(writer)
-
-
-def checked_inputs(inputs: list[str]) -> list[str]:
-    """The inputs; an empty one, which would mean the current folder, is refused."""
-    if not all(text.strip() for text in inputs):
-        raise GknetError("INPUT: expected an image, folder, video or dataset, got an empty name")
-    return inputs
 
 
 def parse_box(text: str | None) -> Box | None:

@@ -28,6 +28,7 @@ class RunRecord:
         oracle: The box comes from the labels of a dataset.
         split: Of a dataset; None for all.
         every: Each n-th picture was taken.
+        bit_depth: Of images of more than 8 bits, as given.
         tta_rotations: See `gknet.inference.crop_estimator.InferenceSettings`.
         version: Of gknet.
     """
@@ -39,6 +40,7 @@ class RunRecord:
     oracle: bool = False
     split: str | None = None
     every: int = 1
+    bit_depth: int | None = None
     tta_rotations: int = 1
     version: str = __version__
 
