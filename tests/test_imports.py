@@ -106,6 +106,12 @@ def test_runtime_imports_nothing_heavy(path: Path) -> None:
     assert not heavy, f"{path.name} imports {sorted(heavy)} at module level"
 
 
+def test_onnxruntime_is_imported_in_one_place() -> None:
+    """There it is kept from the network, and its threads from spinning."""
+    places = [path.name for path in files() if "onnxruntime" in imported(path, on_loading=False)]
+    assert places == ["onnx_session.py"]
+
+
 def loaded_by(code: str) -> set[str]:
     """The top-level modules in a fresh process after `code`."""
     script = f"import sys\n{code}\nprint('MODULES', *{{name.split('.')[0] for name in sys.modules}})"

@@ -29,8 +29,8 @@ class Symmetry(BaseModel):
     Attributes:
         axis: (3,) the axis of rotation in the body frame, of any length.
         angle_deg: The angle in degrees.
-        exact: Whether nothing at all tells the two attitudes apart.
-        broken_by: What does tell them apart, for people.
+        exact: Whether the two attitudes cannot be distinguished at all.
+        broken_by: What distinguishes them, for people.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

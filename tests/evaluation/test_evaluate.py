@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from gknet.dataset.skd import SkdDataset
-from gknet.evaluation.evaluate import evaluate, taken_for
-from gknet.frame import Keypoints
+from gknet.evaluation.evaluate import Protocol, evaluate, taken_for
+from gknet.frame import Box, Keypoints
 from gknet.inference.crop import Crop
 from tests.cli.toy import Noting, ToyEstimator, write_toy_dataset
 
@@ -17,7 +17,8 @@ from tests.cli.toy import Noting, ToyEstimator, write_toy_dataset
 def test_the_truth_makes_the_oracles_crop_and_no_other(tmp_path: Path) -> None:
     dataset = SkdDataset(write_toy_dataset(tmp_path / "set", sequences=1, frames=3))
     truth = [dataset.frame(i, image=False).true_box(dataset.spacecraft.points_m) for i in range(3)]
-    for protocol, boxes in (("oracle", truth), ("detected", [None] * 3)):
+    cases: list[tuple[Protocol, list[Box | None]]] = [("oracle", truth), ("detected", [None] * 3)]
+    for protocol, boxes in cases:
         estimator = Noting()
         evaluate(dataset, estimator, (protocol,))
         assert estimator.given == boxes

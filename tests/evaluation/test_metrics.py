@@ -115,7 +115,9 @@ def test_nees_of_drawn_errors_is_six() -> None:
         error = root @ generator.normal(size=6)
         rotation = Rotation.from_rotvec(-error[:3]).as_matrix() @ POSE.rotation
         found = Pose(rotation, POSE.translation_m - error[3:])
-        squared.append(nees(POSE, Estimate(cam_from_body=found, covariance=covariance)))
+        value = nees(POSE, Estimate(cam_from_body=found, covariance=covariance))
+        assert value is not None
+        squared.append(value)
     assert np.mean(squared) == pytest.approx(6, abs=0.5)
 
 
@@ -158,9 +160,9 @@ def many(sequences: int, frames: int, seed: int) -> list[FrameErrors]:
             e_t = 1.0 if k % 10 == 9 else 0.01
             kind = FailureKind.TOO_FEW_INLIERS if k % 10 == 9 else None
             rmse = level + generator.normal(0, 0.5)
-            known = {"rmse_px": rmse, "e_t": e_t, "failure": kind, "earth_in_view": float(s % 3 == 0)}
-            known["attitude_confidence"] = None if kind else 0.3 if s == 0 else 0.9
-            found.append(replace(one, name=f"{s}/{k}", sequence=str(s), **known))
+            known = replace(one, name=f"{s}/{k}", sequence=str(s), rmse_px=rmse, e_t=e_t, failure=kind)
+            confidence = None if kind else 0.3 if s == 0 else 0.9
+            found.append(replace(known, earth_in_view=float(s % 3 == 0), attitude_confidence=confidence))
     return found
 
 

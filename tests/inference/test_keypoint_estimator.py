@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,24 +79,42 @@ class PerfectNetwork:
         return NetworkOutput(gaussians(self.truth_in(images) / 4)[None])
 
 
-class PerfectLocator(PerfectNetwork):
-    """The points are two corners of the box."""
+def perfect_locator(box: Box, chart: Chart) -> Callable[[np.ndarray], np.ndarray]:
+    """Reads from the chart where the corners of the box are."""
+    corners = PerfectNetwork(np.array([[box.x0, box.y0], [box.x1, box.y1]]), chart)
 
-    def __call__(self, images: np.ndarray) -> np.ndarray:
-        (x0, y0), (x1, y1) = self.truth_in(images)
+    def locate(images: np.ndarray) -> np.ndarray:
+        (x0, y0), (x1, y1) = corners.truth_in(images)
         return locator_output((x0, y0, x1, y1))[None]
 
+    return locate
 
-def perfect(pose: Pose, swapped: int = 0, **settings: object) -> tuple[KeypointEstimator, Frame]:
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A picture with its truth, and an estimator whose network makes no error."""
+
+    estimator: KeypointEstimator
+    network: PerfectNetwork
+    frame: Frame
+    image: np.ndarray
+    box: Box
+
+
+def perfect(pose: Pose, swapped: int = 0, refine_crop: bool = True) -> Scene:
     blank = Frame("chart", None, CAMERA, pose)
     box = blank.true_box(POINTS)
     assert box is not None
     chart = Chart(CAMERA, box)
     network = PerfectNetwork(blank.keypoints_px(POINTS), chart, swapped)
-    locator = PerfectLocator(np.array([[box.x0, box.y0], [box.x1, box.y1]]), chart)
-    return KeypointEstimator(network, CRAFT, locator, InferenceSettings(**settings)), replace(
-        blank, image=chart.image()
-    )
+    settings = InferenceSettings(refine_crop=refine_crop)
+    estimator = KeypointEstimator(network, CRAFT, perfect_locator(box, chart), settings)
+    image = chart.image()
+    return Scene(estimator, network, replace(blank, image=image), image, box)
+
+
+def with_attitude(network: PerfectNetwork, attitude: np.ndarray) -> Callable[[np.ndarray], NetworkOutput]:
+    return lambda images: network(images)._replace(attitude=attitude)
 
 
 POSES = {
@@ -109,10 +129,10 @@ POSES = {
 @pytest.mark.parametrize("name", POSES)
 @pytest.mark.parametrize("oracle", [True, False])
 def test_image_to_pose(name: str, oracle: bool) -> None:
-    estimator, frame = perfect(POSES[name])
-    estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS) if oracle else None)
+    scene = perfect(POSES[name])
+    estimate = scene.estimator.estimate(scene.image, CAMERA, scene.box if oracle else None)
     assert estimate.failure is None
-    found = compute_errors(frame, estimate, CRAFT)
+    found = compute_errors(scene.frame, estimate, CRAFT)
     assert found.e_t < 1e-3
     assert found.e_q_rad < 3e-3
     assert found.rmse_px is not None
@@ -121,7 +141,7 @@ def test_image_to_pose(name: str, oracle: bool) -> None:
     assert found.locator_iou > (0.999 if oracle else 0.9)
 
 
-def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
+def test_what_one_orientation_alone_shows_is_averaged_out() -> None:
     """A dot in the picture, and a higher peak at one cell of every view, which is another place in each of them."""
     y, x = np.mgrid[:256, :256] + 0.5
     dot = np.exp(-((x - 170) ** 2 + (y - 80) ** 2) / (2 * 6**2))
@@ -138,7 +158,7 @@ def test_what_is_seen_in_one_orientation_alone_is_outvoted() -> None:
         estimator = KeypointEstimator(network, CRAFT, settings=InferenceSettings(tta_rotations=tta_rotations))
         found, _ = estimator.detect(image, Crop(0, 0, 256, 256))
         np.testing.assert_allclose(found.pixels, [place] * 14, atol=0.2)
-        assert found.score.min() > 0.7  # every view says so
+        assert found.score.min() > 0.7  # every view agrees
     assert batches == [1, 2, 4]
 
 
@@ -147,80 +167,78 @@ def test_other_orientations_than_quarter_turns_are_refused() -> None:
         InferenceSettings(tta_rotations=3)
 
 
-def test_a_box_that_the_keypoints_contradict_has_no_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimator, frame = perfect(POSES["middle"])
+def test_a_box_that_the_keypoints_contradict_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = perfect(POSES["middle"])
     true_solve, boxes = estimating.solve_pnp, []
 
-    def solve(*arguments: object) -> PnpResult:
+    def solve(*arguments: Any) -> PnpResult | Failure:
         boxes.append(arguments[5])
         return true_solve(*arguments)
 
     monkeypatch.setattr(estimating, "solve_pnp", solve)
-    good = frame.true_box(POINTS)
-    assert good is not None
+    good = scene.box
     poor = Box(good.x0 + 0.35 * good.side, good.y0, good.x1 + 0.35 * good.side, good.y1)
     for box in (good, poor):
-        estimator.estimate(frame.image, CAMERA, box)
+        scene.estimator.estimate(scene.image, CAMERA, box)
     assert boxes == [good, poor, None]
 
 
 def test_swapped_keypoints_do_not_move_the_pose() -> None:
-    estimator, frame = perfect(POSES["middle"], swapped=5)
-    estimate = estimator.estimate(frame.image, CAMERA)
+    scene = perfect(POSES["middle"], swapped=5)
+    estimate = scene.estimator.estimate(scene.image, CAMERA)
     assert estimate.inliers is not None
     assert not estimate.inliers[:5].any()
-    assert compute_errors(frame, estimate, CRAFT).e_t < 1e-3
+    assert compute_errors(scene.frame, estimate, CRAFT).e_t < 1e-3
 
 
-def test_a_poor_box_is_mended_by_the_second_look() -> None:
-    estimator, frame = perfect(POSES["middle"])
-    true_box = frame.true_box(POINTS)
-    assert true_box is not None
-    shift = 0.35 * true_box.side
-    poor = Box(true_box.x0 + shift, true_box.y0, true_box.x1 + shift, true_box.y1)
-    estimate = estimator.estimate(frame.image, CAMERA, poor)
-    assert estimator.keypoint_network.calls == 2
+def test_a_poor_box_is_mended_by_crop_refinement() -> None:
+    scene = perfect(POSES["middle"])
+    good, shift = scene.box, 0.35 * scene.box.side
+    poor = Box(good.x0 + shift, good.y0, good.x1 + shift, good.y1)
+    estimate = scene.estimator.estimate(scene.image, CAMERA, poor)
+    assert scene.network.calls == 2
     assert estimate.keypoints is not None
     assert estimate.box == poor
     assert estimate.keypoints.score.min() > 0.9
-    once, _ = perfect(POSES["middle"], refine_crop=False)
-    first = once.estimate(frame.image, CAMERA, poor)
-    assert once.keypoint_network.calls == 1
+    once = perfect(POSES["middle"], refine_crop=False)
+    first = once.estimator.estimate(scene.image, CAMERA, poor)
+    assert once.network.calls == 1
     assert first.keypoints is not None
     assert first.keypoints.score.min() < 0.9
 
 
 def test_a_box_far_larger_than_the_image_is_cut_to_it() -> None:
-    estimator, frame = perfect(POSES["close"])
-    estimate = estimator.estimate(frame.image, CAMERA, Box(-1e9, -1e9, 1e9, 1e9))
+    scene = perfect(POSES["close"])
+    estimate = scene.estimator.estimate(scene.image, CAMERA, Box(-1e9, -1e9, 1e9, 1e9))
     assert estimate.box == Box(0.0, 0.0, float(CAMERA.width), float(CAMERA.height))
     assert estimate.failure is None
 
 
-def test_a_good_box_needs_one_look() -> None:
-    estimator, frame = perfect(POSES["middle"])
-    estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
-    assert estimator.keypoint_network.calls == 1
+def test_a_good_box_needs_one_run() -> None:
+    scene = perfect(POSES["middle"])
+    scene.estimator.estimate(scene.image, CAMERA, scene.box)
+    assert scene.network.calls == 1
 
 
 def test_same_image_same_estimate() -> None:
-    estimator, frame = perfect(POSES["middle"])
-    first, second = (estimator.estimate(frame.image, CAMERA) for _ in range(2))
+    scene = perfect(POSES["middle"])
+    first, second = (scene.estimator.estimate(scene.image, CAMERA) for _ in range(2))
+    assert first.covariance is not None
+    assert second.covariance is not None
     assert np.array_equal(first.covariance, second.covariance)
 
 
-def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
-    """Of a twin's attitude, half a turn away about the line of sight, it is told to doubt the pose."""
+def test_attitude_confidence_is_high_for_the_pose_and_low_for_a_symmetric_counterpart() -> None:
+    """The counterpart is half a turn away about the body's z axis."""
     bins, pose = AttitudeBins(12), POSES["beyond the border"]
-    estimator, frame = perfect(pose)
-    box = frame.true_box(POINTS)
-    see = estimator.keypoint_network
-    assert estimator.estimate(frame.image, CAMERA, box).attitude_confidence is None
-    twin = pose @ Pose.from_rotation_vector([0, 0, math.pi], [0, 0, 0])
-    for believed, low, high in ((pose, 0.95, 1.0), (twin, 0.0, 0.05)):
-        label = bins.soft_label(allocentric_wxyz(believed))[None].astype(np.float32)
-        sure = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=label), bins=bins)  # noqa: B023
-        estimate = sure.estimate(frame.image, CAMERA, box)
+    scene = perfect(pose)
+    box = scene.box
+    assert scene.estimator.estimate(scene.image, CAMERA, box).attitude_confidence is None
+    counterpart = pose @ Pose.from_rotation_vector([0, 0, math.pi], [0, 0, 0])
+    for probable, low, high in ((pose, 0.95, 1.0), (counterpart, 0.0, 0.05)):
+        label = bins.soft_label(allocentric_wxyz(probable))[None].astype(np.float32)
+        certain = replace(scene.estimator, keypoint_network=with_attitude(scene.network, label), bins=bins)
+        estimate = certain.estimate(scene.image, CAMERA, box)
         assert estimate.cam_from_body is not None
         assert estimate.cam_from_body.angle_to(pose) < 0.01
         assert estimate.attitude_confidence is not None
@@ -228,65 +246,63 @@ def test_an_estimate_tells_what_the_network_believes_of_its_attitude() -> None:
 
 
 def test_failures_are_values_with_reasons() -> None:
-    estimator, frame = perfect(POSES["middle"])
-    outside = estimator.estimate(frame.image, CAMERA, Box(900, 0, 950, 50))
+    scene = perfect(POSES["middle"])
+    outside = scene.estimator.estimate(scene.image, CAMERA, Box(900, 0, 950, 50))
     assert outside.failure == Failure(FailureKind.BOX_OUTSIDE_IMAGE, "the box lies outside the image")
     blind = KeypointEstimator(lambda images: NetworkOutput(np.zeros((1, 14, 64, 64), dtype=np.float32)), CRAFT)
-    estimate = blind.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    estimate = blind.estimate(scene.image, CAMERA, scene.box)
     assert estimate.failure is not None
     assert estimate.failure.kind == FailureKind.TOO_FEW_KEYPOINTS
     assert "0 keypoints" in str(estimate.failure)
     assert estimate.keypoints is not None
-    lost = KeypointEstimator(
-        estimator.keypoint_network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32)
-    )
-    not_found = lost.estimate(frame.image, CAMERA)
+    lost = KeypointEstimator(scene.network, CRAFT, lambda images: np.zeros((1, 5, 64, 64), dtype=np.float32))
+    not_found = lost.estimate(scene.image, CAMERA)
     assert not_found.failure == Failure(FailureKind.NO_SPACECRAFT, "the locator finds no spacecraft")
 
 
 @pytest.mark.parametrize("range_factor", [0.02, 100.0])
 def test_a_pose_of_another_size_than_the_crop_is_refused(range_factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    estimator, frame = perfect(POSES["middle"])
+    scene = perfect(POSES["middle"])
     true_solve = estimating.solve_pnp
 
-    def solve(*arguments: object) -> PnpResult:
+    def solve(*arguments: Any) -> PnpResult:
         result = true_solve(*arguments)
+        assert isinstance(result, PnpResult)
         pose = result.cam_from_body
         return replace(result, cam_from_body=Pose(pose.rotation, pose.translation_m * range_factor))
 
     monkeypatch.setattr(estimating, "solve_pnp", solve)
-    estimate = estimator.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    estimate = scene.estimator.estimate(scene.image, CAMERA, scene.box)
     assert estimate.cam_from_body is None
     assert estimate.failure is not None
     assert estimate.failure.kind == FailureKind.IMPLAUSIBLE_SIZE
 
 
 def test_thresholds_are_in_pixels_of_the_input() -> None:
-    """A large crop is seen coarsely: 2 px in the input are many in the image, and still no outliers."""
-    estimator, frame = perfect(POSES["close"])
-    network = estimator.keypoint_network
+    """A large crop is resized coarsely: 2 px in the input are many in the image, and still no outliers."""
+    scene = perfect(POSES["close"])
+    network = scene.network
     jitter = np.random.default_rng(1).normal(0, 2.0, POINTS.shape[:1] + (2,))
 
     def jittered(images: np.ndarray) -> NetworkOutput:
         return NetworkOutput(gaussians((network.truth_in(images) + jitter) / 4)[None])
 
     strict = PnpSettings(threshold_px=(6.0,), min_inlier_fraction=0.9)
-    estimate = KeypointEstimator(jittered, CRAFT, pnp=strict).estimate(frame.image, CAMERA, frame.true_box(POINTS))
+    estimate = KeypointEstimator(jittered, CRAFT, pnp=strict).estimate(scene.image, CAMERA, scene.box)
     assert estimate.failure is None
     assert estimate.reprojection_rms_px is not None
     assert estimate.reprojection_rms_px > 3
 
 
 def test_bad_use_is_refused() -> None:
-    estimator, frame = perfect(POSES["middle"])
+    scene = perfect(POSES["middle"])
     with pytest.raises(GknetError, match="800 x 640"):
-        estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
+        scene.estimator.estimate(np.zeros((100, 100, 3), dtype=np.uint8), CAMERA)
     with pytest.raises(GknetError, match="give a box"):
-        KeypointEstimator(estimator.keypoint_network, CRAFT).estimate(frame.image, CAMERA)
-    see = estimator.keypoint_network
-    few = replace(estimator, keypoint_network=lambda images: see(images)._replace(attitude=np.ones((1, 4), np.float32)))
+        KeypointEstimator(scene.network, CRAFT).estimate(scene.image, CAMERA)
+    few = replace(scene.estimator, keypoint_network=with_attitude(scene.network, np.ones((1, 4), np.float32)))
     with pytest.raises(GknetError, match="864 classes of attitude, got 4"):
-        replace(few, bins=AttitudeBins(12)).estimate(frame.image, CAMERA, frame.true_box(POINTS))
+        replace(few, bins=AttitudeBins(12)).estimate(scene.image, CAMERA, scene.box)
     wrong = KeypointEstimator(lambda images: NetworkOutput(np.zeros((1, 3, 64, 64), dtype=np.float32)), CRAFT)
     with pytest.raises(GknetError, match="14 heatmaps"):
-        wrong.estimate(frame.image, CAMERA, frame.true_box(POINTS))
+        wrong.estimate(scene.image, CAMERA, scene.box)

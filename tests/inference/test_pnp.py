@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hypothesis
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import nees, pose_error_vector
 from gknet.frame import Box, Estimate, Failure, FailureKind, Keypoints
 from gknet.geometry import Camera, Pose
-from gknet.inference.pnp import PnpResult, PnpSettings, solve_pnp
+from gknet.inference.pnp import PnpResult, PnpSettings, _consensus, solve_pnp
+from gknet.inference.refine_pose import PnpProblem
 from tests.strategies import quaternions
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (16, 3)) * (3, 1, 1)
@@ -81,7 +84,9 @@ def test_covariance_matches_the_scatter() -> None:
         scatter.append(pose_error_vector(POSE, result.cam_from_body))
         stated.append(np.diag(result.covariance))
         estimate = Estimate(keypoints, result.cam_from_body, result.covariance, result.inliers, 0.0)
-        squared.append(nees(POSE, estimate))
+        value = nees(POSE, estimate)
+        assert value is not None
+        squared.append(value)
     ratio = np.array(scatter).var(axis=0) / np.mean(stated, axis=0)
     assert (np.abs(ratio - 1) < 0.35).all(), ratio
     assert 5.2 < np.mean(squared) < 7.2
@@ -164,6 +169,50 @@ def test_thresholds_follow_the_size_of_an_input_pixel() -> None:
     strict = PnpSettings(threshold_px=(5.0,), min_inlier_fraction=0.8)
     assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 1.0, strict), Failure)
     assert isinstance(solve_pnp(keypoints, CAMERA, POINTS, 8.0, strict), PnpResult)
+
+
+def test_consensus_has_the_pixel_convention_of_the_camera() -> None:
+    """PoseLib by itself, before any refinement: half a pixel between its convention and ours would show as a shift.
+
+    The centre of the first pixel is (0.5, 0.5) in the pixels and in K alike, so the convention cancels.
+    """
+    generator = np.random.default_rng(11)
+    half = np.array([0.5, 0.5])
+    for _ in range(50):
+        pose = Pose.from_quaternion(generator.normal(size=4), [0.4, -0.3, generator.uniform(8, 20)])
+        shifts = []
+        for pixels_by, centre_by in ((0, 0), (half, half), (half, 0)):
+            matrix = CAMERA.matrix.copy()
+            matrix[:2, 2] += centre_by
+            camera = Camera(matrix, CAMERA.width, CAMERA.height)
+            given = CAMERA.project(pose.transform(POINTS)) + pixels_by
+            problem = PnpProblem(POINTS, np.arange(16), given, np.tile(np.eye(2), (16, 1, 1)), camera, None)
+            found = _consensus(problem, np.full(16, 0.9), 5.0)
+            assert found is not None
+            offset_m = (found.translation_m - pose.translation_m)[:2]
+            shifts.append(float(np.linalg.norm(offset_m * 1400 / pose.translation_m[2])))
+        assert max(shifts[:2]) < 1e-6
+        assert shifts[2] > 0.3  # half a pixel in x and in y, which the rotation takes a part of
+
+
+@hypothesis.given(
+    values=st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=16, max_size=16),
+    variance=st.floats(0, 1e300),
+)
+@hypothesis.settings(max_examples=60, deadline=None)
+def test_wild_numbers_end_in_a_pose_or_a_failure(values: list[float], variance: float) -> None:
+    pixels = detections(POSE).pixels.copy()
+    pixels[:8] = np.array(values).reshape(8, 2)
+    keypoints = Keypoints(pixels, np.full(16, 0.9), np.tile(variance * np.eye(2), (16, 1, 1)))
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        assert isinstance(solve_pnp(keypoints, CAMERA, POINTS), PnpResult | Failure)
+
+
+def test_points_that_are_not_finite_are_an_error() -> None:
+    points = POINTS.copy()
+    points[3] = np.inf
+    with pytest.raises(GknetError, match="finite points"):
+        solve_pnp(detections(POSE), CAMERA, points)
 
 
 def test_wrong_count_is_an_error() -> None:

@@ -1,7 +1,7 @@
-"""How sure keypoints and poses may be, fitted to the errors on a validation split.
+"""Covariances of keypoints and poses, fitted to the errors on a validation split.
 
-Two steps. A keypoint's covariance is a floor and a factor times the spread that its peak tells; both are fitted to the
-keypoints' errors. Then the pose's covariance gets one factor, since keypoints of one picture err alike.
+Two steps. A keypoint's covariance is a floor and a factor times the spread that follows from its peak; both are fitted
+to the keypoints' errors. Then the pose's covariance gets one factor, since keypoints of one picture err alike.
 """
 
 from __future__ import annotations
@@ -25,18 +25,26 @@ from gknet.inference.keypoint_estimator import KeypointEstimator
 from gknet.inference.network_io import check_image
 
 STUDENT_DOF = 4.0
-"""Of the Student distribution that is fitted: its tails leave room for swaps, which are outliers of the pose."""
+"""Degrees of freedom of the fitted Student distribution: its tails leave room for keypoint swaps."""
 
 MIN_SAMPLES = 30
-"""Keypoints to fit to, and poses."""
+"""The fewest keypoints, and the fewest poses, to fit to."""
 
 UNCALIBRATED = Decoding(floor_cells=1e-3, spread_scale=1.0)
-"""Decodes the spread of a peak and no more."""
+"""A decoding whose covariance is the spread that follows from a peak, and no more."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationSample:
-    """What a network detected in a frame's oracle crop. `keypoints` are UNCALIBRATED, no image."""
+    """What a network detected in a frame's oracle crop.
+
+    Attributes:
+        frame: The frame with its true pose, without its image.
+        box: The true box, from which the crop was made.
+        crop: The oracle crop.
+        keypoints: In pixels of the image, their covariance `UNCALIBRATED`.
+        cells_per_px: Cells of the heatmap per image pixel.
+    """
 
     frame: Frame
     box: Box
@@ -45,7 +53,7 @@ class CalibrationSample:
     cells_per_px: float
 
     def decoded(self, decoding: Decoding) -> Keypoints:
-        """The keypoints as `decoding` would have it."""
+        """The keypoints with the covariance of another decoding."""
         floor = (decoding.floor_cells / self.cells_per_px) ** 2 * np.eye(2)
         return replace(self.keypoints, covariance_px2=decoding.spread_scale * self.keypoints.covariance_px2 + floor)
 
@@ -55,7 +63,16 @@ class CalibrationSample:
 
 
 def collect_sample(frame: Frame, bare: KeypointEstimator, stride: float) -> CalibrationSample:
-    """Look at a frame with an estimator whose decoding is UNCALIBRATED; `stride` is its network's."""
+    """Detect the keypoints in a frame's oracle crop.
+
+    Args:
+        frame: With its image and true pose.
+        bare: An estimator whose decoding is `UNCALIBRATED`.
+        stride: Input pixels per cell of its network.
+
+    Raises:
+        GknetError: No keypoint is in view, or the frame has no image.
+    """
     box = frame.true_box(bare.spacecraft.points_m)
     if box is None:
         raise GknetError(f"frame {frame.name}: no keypoint is in view, so there is nothing to calibrate on")
@@ -65,7 +82,18 @@ def collect_sample(frame: Frame, bare: KeypointEstimator, stride: float) -> Cali
 
 
 def calibrated(estimator: KeypointEstimator, samples: Sequence[CalibrationSample]) -> KeypointEstimator:
-    """The estimator with a decoding and a covariance scale that fit its errors in `samples`."""
+    """The estimator with a decoding and a covariance scale that fit its errors.
+
+    Args:
+        estimator: Whose network made the samples.
+        samples: From frames of a validation split.
+
+    Returns:
+        The calibrated estimator. The pose's covariance is left alone where there are fewer than 30 poses.
+
+    Raises:
+        GknetError: There are fewer than 30 detected keypoints in view.
+    """
     points_m = estimator.spacecraft.points_m
     errors, spreads = [], []
     for sample in samples:
@@ -93,6 +121,10 @@ def fit_decoding(error_cells: Float[ndarray, "k 2"], spread_cells2: Float[ndarra
     """The floor and the factor on the spread under which the errors are most likely.
 
     A Student distribution is fitted, then scaled so that errors without outliers would give back their covariance.
+
+    Args:
+        error_cells: (k, 2) detected minus true positions, in cells of the heatmap.
+        spread_cells2: (k, 2, 2) the uncalibrated covariances.
     """
 
     def cost(log_parameters: Float[ndarray, "2"]) -> float:

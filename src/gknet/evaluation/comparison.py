@@ -1,9 +1,9 @@
 """Methods against each other on the same frames: means and paired differences with their intervals.
 
-A `Trial` is one trained network judged on the test frames. Intervals are bootstrapped over sequences, the frames of
+A `Trial` is one trained network evaluated on the test frames. Intervals are bootstrapped over sequences, the frames of
 which are alike, and over seeds, which are few: of n of them n - 1 are drawn with replacement, since n would hide a part
-1/n of the variance (Rao and Wu 1988), the same draw for both methods. One seed says nothing of the luck of a training,
-and with two or three the interval is still too short: see whether the seeds agree.
+1/n of the variance (Rao and Wu 1988), the same draw for both methods. One seed does not measure the variance between
+trainings, and with two or three the interval is still too short: check whether the seeds agree.
 """
 
 from __future__ import annotations
@@ -19,23 +19,28 @@ from gknet.errors import GknetError
 from gknet.evaluation.evaluate import Case, ProtocolRun, confusion
 
 LOW_VISIBILITY = 0.6
-"""Share of the keypoints that are seen, below which a frame counts as one of low visibility."""
+"""Share of the keypoints that are visible, below which a frame counts as one of low visibility."""
 
 ATTITUDE_HOLDS_RAD = 0.35
-"""E_q (20 degrees) beyond which an attitude is wrong as a whole, a twin's or a guess, and not just inexact."""
+"""E_q (20 degrees) beyond which an attitude is wrong as a whole, as that of a symmetric counterpart is."""
 
 
 class NothingKnownError(GknetError):
-    """A metric that no frame of a trial has, as of hidden keypoints where none is hidden."""
+    """No frame of a trial has the metric, as of hidden keypoints where none is hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One network's errors on the test frames.
 
-    sequences  (m,) the sequence of each frame
-    values     metric of `measured` -> (m,), NaN where the frame cannot say
-    confusion  (n, n) how often keypoint i was detected at keypoint j
+    Attributes:
+        method: What is compared.
+        spacecraft: Its name.
+        seed: Of the training.
+        frames: (m,) names of the frames.
+        sequences: (m,) the sequence of each frame.
+        values: Metric of `measured` -> (m,), NaN where a frame has no value.
+        confusion: (n, n) how often keypoint i was detected at keypoint j.
     """
 
     method: str
@@ -48,6 +53,7 @@ class Trial:
 
     @staticmethod
     def of(run: ProtocolRun, method: str, spacecraft: str, seed: int) -> Trial:
+        """The errors of an evaluation under one protocol."""
         found = [case.errors for case in run.cases]
         rows = [measured(case) for case in run.cases]
         values = {
@@ -59,7 +65,7 @@ class Trial:
         return Trial(method, spacecraft, seed, frames, sequences, values, confusion(run))
 
     def to_dict(self) -> dict[str, object]:
-        """Ready for JSON: four digits, null where the frame cannot say."""
+        """Ready for JSON: four digits, null where a frame has no value."""
         values = {
             name: [None if np.isnan(v) else float(f"{v:.4g}") for v in column] for name, column in self.values.items()
         }
@@ -75,6 +81,11 @@ class Trial:
 
     @staticmethod
     def from_dict(content: Mapping[str, object]) -> Trial:
+        """The inverse of `to_dict`.
+
+        Raises:
+            GknetError: The content is not that of a trial.
+        """
         try:
             values = {
                 str(name): np.array([np.nan if v is None else v for v in column], dtype=np.float64)
@@ -94,12 +105,12 @@ class Trial:
 
 
 def measured(case: Case) -> dict[str, float | None]:
-    """What methods are compared by, None where the frame cannot say.
+    """What methods are compared by.
 
-    rmse_px, rmse_hidden_px, e_t, e_q_rad   as in `gknet.evaluation.metrics.FrameErrors`
-    rmse_low_px   rmse_px of a frame of low visibility
-    swapped       share of the keypoints in view that were detected at another one's place (`taken_for`); None where
-                  nothing was detected
+    Returns:
+        Metric -> value, None where the frame has none: rmse_px, rmse_hidden_px, e_t and e_q_rad as in
+        `gknet.evaluation.metrics.FrameErrors`; rmse_low_px, which is rmse_px of a frame of low visibility; swapped, the
+        share of the keypoints in view that were detected at another one's position (None where nothing was detected).
     """
     errors = case.errors
     low = errors.visible_fraction is not None and errors.visible_fraction < LOW_VISIBILITY
@@ -117,7 +128,13 @@ def measured(case: Case) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean, or a difference of means, with its 95 % interval."""
+    """A mean, or a difference of means, with its 95 % interval.
+
+    Attributes:
+        mean: The mean.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+    """
 
     mean: float
     low: float
@@ -125,11 +142,23 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
+        """Whether a difference is significant at 5 %."""
         return self.low > 0 or self.high < 0
 
 
 def mean_of(trials: Sequence[Trial], metric: str, seed: int = 0, resamples: int = 2000) -> Interval:
-    """The mean over frames and seeds of one method on one spacecraft."""
+    """The mean over frames and seeds of one method on one spacecraft.
+
+    Args:
+        trials: One for each seed, on the same frames.
+        metric: Of `measured`.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+
+    Raises:
+        NothingKnownError: No frame has the metric.
+        GknetError: There is no trial, the frames differ, or no trial knows the metric.
+    """
     table, counts = _by_sequence(trials, metric)
     means = _resampled(table, counts, *_draws(len(trials), counts.shape[1], seed, resamples))
     return Interval(float(table.sum() / counts.sum()), *_ends(means))
@@ -138,9 +167,20 @@ def mean_of(trials: Sequence[Trial], metric: str, seed: int = 0, resamples: int 
 def difference(
     first: Sequence[Trial], second: Sequence[Trial], metric: str, seed: int = 0, resamples: int = 2000
 ) -> Interval:
-    """Mean of the first method less that of the second, on the same frames; negative where the first is better.
+    """Mean of the first method minus that of the second, on the same frames; negative where the first is better.
 
     With as many seeds on both sides they are drawn as pairs.
+
+    Args:
+        first: Trials of one method, one for each seed.
+        second: Trials of the other method.
+        metric: Of `measured`.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+
+    Raises:
+        NothingKnownError: No frame has the metric.
+        GknetError: There is no trial, the frames differ, or no trial knows the metric.
     """
     _check_frames(first[0], second[0])
     tables = [_by_sequence(trials, metric) for trials in (first, second)]
@@ -152,7 +192,7 @@ def difference(
 
 
 def seed_gaps(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> list[float]:
-    """The difference of the means of each seed by itself, in the metric's unit; NaN of one that knows nothing."""
+    """The difference of the means of each seed by itself, in the metric's unit; NaN where no frame has a value."""
 
     def mean(trial: Trial) -> float:
         known = trial.values[metric][~np.isnan(trial.values[metric])]
@@ -162,7 +202,7 @@ def seed_gaps(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> l
 
 
 def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """Both methods, seed by seed, on the frames in which the attitudes of both hold; the other values are NaN."""
+    """Both methods, seed by seed, on the frames in which both attitudes are within 20 degrees; other values are NaN."""
 
     def masked(trial: Trial, known: Bool[ndarray, " m"]) -> Trial:
         return replace(trial, values={name: np.where(known, column, np.nan) for name, column in trial.values.items()})
@@ -177,7 +217,7 @@ def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tup
 
 def _check_frames(one: Trial, other: Trial) -> None:
     if one.frames != other.frames:
-        raise GknetError(f"comparison: {one.method} and {other.method} were judged on different frames")
+        raise GknetError(f"comparison: {one.method} and {other.method} were evaluated on different frames")
 
 
 def _by_sequence(
@@ -189,7 +229,7 @@ def _by_sequence(
     for trial in trials:
         _check_frames(trials[0], trial)
     if any(metric not in trial.values for trial in trials):
-        raise GknetError(f"comparison: the trials of {trials[0].method} know no metric {metric}; judge them again")
+        raise GknetError(f"comparison: the trials of {trials[0].method} have no metric {metric}; evaluate them again")
     names = sorted(set(trials[0].sequences))
     place = np.array([names.index(sequence) for sequence in trials[0].sequences])
     sums, counts = np.zeros((len(trials), len(names))), np.zeros((len(trials), len(names)))

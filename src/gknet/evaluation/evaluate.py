@@ -34,11 +34,17 @@ UNKNOWN_WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One frame's answer. `index` is its place in the dataset.
+    """One frame's estimate and its errors.
 
-    keypoint_px  (n,) distances in pixels of the 256 oracle crop, NaN for keypoints out of view
-    taken_for    (n,) the true keypoint at which each detection lies (`taken_for`)
-    visible         (n,) bool: in view and not hidden; None when unknown
+    Attributes:
+        index: The frame's place in the dataset.
+        frame_name: Its name.
+        estimate: The estimate.
+        errors: Compared with the truth.
+        keypoint_px: (n,) distances in pixels of the 256 oracle crop, NaN for keypoints out of view.
+        taken_for: (n,) the true keypoint at which each detection lies (see the function).
+        visible: (n,) bool: in view and not hidden; None when unknown.
+        seconds: From the image to the pose, reading excluded.
     """
 
     index: int
@@ -53,24 +59,37 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class ProtocolRun:
-    """All frames under one protocol."""
+    """All frames under one protocol.
+
+    Attributes:
+        protocol: Where the boxes come from: "oracle" (the truth) or "detected" (the locator).
+        cases: The frames, in the dataset's order.
+    """
 
     protocol: Protocol
     cases: tuple[Case, ...]
 
     @cached_property
     def summary(self) -> Summary:
+        """The metrics over all frames."""
         return summarise([case.errors for case in self.cases])
 
     @property
     def median_ms(self) -> float:
-        """Of one estimate: everything from the image to the pose, reading excluded."""
+        """Median duration of one estimate in ms, from the image to the pose, reading excluded."""
         return 1000 * float(np.median([case.seconds for case in self.cases]))
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """`runs` saw the same frames. `passed_over` could not be read or show no keypoint, and are in no mean."""
+    """A dataset's frames under each protocol.
+
+    Attributes:
+        spacecraft: Whose poses they are.
+        data: Where the frames come from, for people.
+        runs: One for each protocol, over the same frames.
+        passed_over: Frames that could not be read or show no keypoint; they are in no mean.
+    """
 
     spacecraft: Spacecraft
     data: str
@@ -109,7 +128,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class KeypointStatistics:
-    """Of one keypoint where it is in view, px of the 256 crop; None when it never is."""
+    """The errors of one keypoint where it is in view, in px of the 256 oracle crop; None when it never is.
+
+    Attributes:
+        frames: How many frames have it in view.
+        median_px: The median.
+        high_px: The 90th percentile.
+        hidden_median_px: The median where the spacecraft hides it.
+    """
 
     frames: int
     median_px: float | None
@@ -117,6 +143,7 @@ class KeypointStatistics:
     hidden_median_px: float | None
 
     def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
         return {
             "frames": self.frames,
             "median_px": self.median_px,
@@ -146,10 +173,17 @@ def evaluate(
     data: str = "",
     on_frame: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Estimate every frame under each protocol; a frame that cannot be read is noted and passed over.
+    """Estimate every frame under each protocol; a frame that cannot be read is recorded and passed over.
 
-    data      words for the report: where the frames come from
-    on_frame  called after each frame, for a progress bar
+    Args:
+        dataset: With true poses.
+        estimator: Of the dataset's spacecraft; with a locator for the protocol "detected".
+        protocols: Where the boxes come from.
+        data: Where the frames come from, for the report; the dataset's folder when empty.
+        on_frame: Called after each frame, for a progress bar.
+
+    Raises:
+        GknetError: No frame could be used.
     """
     cases: dict[Protocol, list[Case]] = {protocol: [] for protocol in protocols}
     passed_over = []
@@ -200,11 +234,19 @@ def _case(index: int, frame: Frame, sequence: str, estimator: PoseEstimator, pro
 def taken_for(
     keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], in_view: Bool[ndarray, " n"], crop: Crop
 ) -> Int[ndarray, " n"]:
-    """For each keypoint in view, the true keypoint that its detection lies at; -1 for none, and out of view.
+    """The true keypoint at which each detection lies.
 
-    What has no peak (score 0) is no detection.
+    A detection within `SWAP_PX` (pixels of the 256 oracle crop) of its own keypoint is at that one; else it is at the
+    nearest other one within `SWAP_PX`. What has no peak (score 0) is no detection.
 
-    Within SWAP_PX of its own (pixels of the 256 oracle crop) it is itself; else the nearest other one within SWAP_PX.
+    Args:
+        keypoints: As detected; None without a detection.
+        true_px: (n, 2) true keypoints in image pixels.
+        in_view: (n,) bool.
+        crop: The 256 oracle crop.
+
+    Returns:
+        (n,) indices; -1 for a detection at no keypoint, for none, and for a keypoint out of view.
     """
     count = len(true_px)
     if keypoints is None:
@@ -217,7 +259,7 @@ def taken_for(
 
 
 def confusion(run: ProtocolRun) -> Int[ndarray, "n n"]:
-    """How often keypoint i (row) in view was detected at keypoint j: the diagonal is right, the rest are swaps."""
+    """(n, n) how often keypoint i (row) in view was detected at keypoint j: off the diagonal are swaps."""
     taken = np.stack([case.taken_for for case in run.cases])
     matrix = np.zeros((taken.shape[1], taken.shape[1]), dtype=np.int64)
     for row, column in enumerate(taken.T):

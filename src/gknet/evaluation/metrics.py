@@ -30,7 +30,6 @@ ORACLE_SIZE = 256
 FAILED_E_T = 1.0
 FAILED_E_Q = float(np.pi)
 FAILED_ADD = 1.0
-FAILED_SPEED = FAILED_E_T + FAILED_E_Q
 
 RANGE_EDGES_DIAMETERS = (0.0, 1.5, 2.5, 4.0, 7.0, 12.0, np.inf)
 PHASE_EDGES_DEG = (0.0, 30.0, 60.0, 90.0, 120.0, 180.0)
@@ -41,17 +40,31 @@ CONFIDENCE_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """What one frame adds to the summaries; None where the frame cannot say.
+    """What one frame adds to the summaries; None where the frame has no such value.
 
-    rmse_px            eq. 6 over the keypoints in view; rmse_hidden_px over those of them that the craft hides
-    pck_2, _5, _10     part of the keypoints in view that are nearer than 2, 5, 10 px
-    e_t, e_q_rad       eq. 7 (relative) and eq. 8; speed_score is their sum
-    add                mean distance of the keypoints between both poses, in diameters; add_s to the nearest one
-    locator_iou        of the estimate's box with the true one
-    nees               squared pose error over the covariance: 6 in the mean when the covariance is right
-    visible_fraction   keypoints in view and not hidden, over all
-    earth_in_view      1 with a part of the Earth in the picture, 0 without
-    attitude_confidence    of the estimate; None without a pose, or of a network that has none
+    Attributes:
+        name: Of the frame.
+        sequence: Frames of one sequence are resampled together.
+        failure: The kind of failure; None with a pose.
+        rmse_px: Eq. 6 over the keypoints in view.
+        rmse_hidden_px: The same over those of them that the spacecraft hides.
+        pck_2: Part of the keypoints in view that are nearer than 2 px.
+        pck_5: Nearer than 5 px.
+        pck_10: Nearer than 10 px.
+        e_t: Eq. 7, relative.
+        e_q_rad: Eq. 8.
+        speed_score: The sum of both.
+        add: Mean distance between the keypoints of both poses, in diameters.
+        add_s: Mean distance to the nearest keypoint of the other pose, in diameters.
+        add_below_tenth: 1 with an `add` below a tenth, else 0.
+        locator_iou: Intersection over union of the estimate's box and the true one.
+        nees: Squared pose error over the covariance: 6 in the mean when the covariance is right.
+        range_m: True distance.
+        range_diameters: True distance in diameters.
+        phase_angle_rad: `Frame.phase_angle_rad`.
+        visible_fraction: Keypoints in view and not hidden, over all.
+        earth_in_view: 1 with a part of the Earth in the picture, 0 without.
+        attitude_confidence: Of the estimate; None without a pose, or of a network that has none.
     """
 
     name: str
@@ -79,7 +92,11 @@ class FrameErrors:
 
 
 def oracle_crop(frame: Frame, spacecraft: Spacecraft, size: int = ORACLE_SIZE) -> Crop:
-    """The crop about the true keypoints: the paper's protocol, and the unit of the keypoint errors."""
+    """The crop about the true keypoints: the paper's protocol, and the unit of the keypoint errors.
+
+    Raises:
+        GknetError: No keypoint is in view, or the frame has no true pose.
+    """
     box = frame.true_box(spacecraft.points_m)
     if box is None:
         raise GknetError(f"frame {frame.name}: no keypoint is in view, so there is no oracle crop")
@@ -91,8 +108,15 @@ def compute_errors(
 ) -> FrameErrors:
     """Compare an estimate with the frame's truth.
 
-    crop       the 256 oracle crop, whose scale is the unit of the keypoint errors; made here when None
-    sequence   frames of one sequence are resampled together; None makes the frame a sequence of its own
+    Args:
+        frame: With its true pose.
+        estimate: Of the frame.
+        spacecraft: Whose pose it is.
+        crop: The 256 oracle crop, whose scale is the unit of the keypoint errors; made here when None.
+        sequence: Frames of one sequence are resampled together; None makes the frame a sequence of its own.
+
+    Raises:
+        GknetError: The frame has no true pose, or shows no keypoint.
     """
     truth = frame.cam_from_body
     if truth is None:
@@ -133,7 +157,7 @@ def compute_errors(
 
 
 def keypoint_errors_px(keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], crop: Crop) -> Float[ndarray, " n"]:
-    """Distances in pixels of the oracle crop.
+    """Distances from the true keypoints, (n,) in pixels of the oracle crop.
 
     Where nothing was detected, as in a picture without a box, every keypoint is off by the crop's diagonal. One whose
     heatmap has no peak (score 0) counts at the centre of the input, where `decode_heatmaps` puts it.
@@ -206,7 +230,15 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Statistic:
-    """Of one metric over `frames` frames: the mean with its 95 % interval (bootstrap by sequence), and the median."""
+    """One metric over many frames.
+
+    Attributes:
+        mean: The mean.
+        low: Lower end of its 95 % interval (bootstrap over sequences).
+        high: Upper end of it.
+        median: The median.
+        frames: How many frames have the metric.
+    """
 
     mean: float
     low: float
@@ -217,7 +249,16 @@ class Statistic:
 
 @dataclass(frozen=True)
 class Bin:
-    """Frames whose `by` lies in [low, high)."""
+    """The frames whose value of one attribute lies in a range.
+
+    Attributes:
+        by: Name of the attribute of `FrameErrors`.
+        low: Lower end, included.
+        high: Upper end, excluded, but included in the last bin.
+        frames: How many frames.
+        failures: How many of them have no pose.
+        metrics: Over these frames.
+    """
 
     by: str
     low: float
@@ -229,10 +270,17 @@ class Bin:
 
 @dataclass(frozen=True)
 class Summary:
-    """Of many frames. The coverages are of the poses' 6x6 covariances, over the frames that have a pose.
+    """The metrics over many frames.
 
-    failures     frames without a pose per kind of failure, the most frequent first
-    located_07   part of the frames whose box overlaps the true one by an IoU of 0.7 or more
+    Attributes:
+        frames: How many frames.
+        sequences: How many sequences.
+        failures: Frames without a pose for each kind of failure, the most frequent first.
+        metrics: Metric -> statistic; a metric that no frame has is absent.
+        located_07: Part of the frames whose box overlaps the true one by an IoU of 0.7 or more.
+        coverage_68: Part of the poses whose error lies in the 68 % ellipsoid of their 6x6 covariance.
+        coverage_95: The same of the 95 % ellipsoid.
+        bins: By range, phase angle, visibility, the Earth and attitude confidence.
     """
 
     frames: int
@@ -250,7 +298,16 @@ class Summary:
 
 
 def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int = 1000) -> Summary:
-    """Means, medians and 95 % intervals of every metric: overall, and by what the bins are of."""
+    """Means, medians and 95 % intervals of every metric, overall and in bins.
+
+    Args:
+        frame_errors: One for each frame.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+
+    Raises:
+        GknetError: There is no frame.
+    """
     if not frame_errors:
         raise GknetError("summary: expected at least one frame, got none")
     squared = np.array([e.nees for e in frame_errors if e.nees is not None])
@@ -268,7 +325,7 @@ def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int
 
 
 def _coverage(squared: Float[ndarray, " k"], part: float) -> float | None:
-    """How many true poses lie inside the ellipsoid that should hold this part of them."""
+    """The part of the true poses inside the ellipsoid that should hold `part` of them."""
     return float((squared <= chi2.ppf(part, 6)).mean()) if len(squared) else None
 
 

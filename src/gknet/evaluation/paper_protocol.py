@@ -1,6 +1,7 @@
 """The paper's way from heatmaps to a pose, for its tables: the highest cell of 32x32 (eq. 5), then plain PnP.
 
-No part of a cell, no belief, no outlier rejection, and a crop made of the true keypoints. `Estimator` does better.
+Whole cells, no covariance, no outlier rejection, and a crop made of the true keypoints. `KeypointEstimator` is more
+accurate.
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ CELLS = 32
 
 @dataclass(frozen=True, eq=False)
 class PaperEstimator:
-    """Stands where an `Estimator` does; a box must be given, as the paper's crops come from the annotations.
+    """A `PoseEstimator` by the paper's protocol. A box must be given: the paper's crops come from the annotations.
 
-    keypoint_network   (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride)
+    Attributes:
+        keypoint_network: (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride).
+        spacecraft: The spacecraft whose pose is estimated.
+        input_size: Side of the network's input in pixels.
     """
 
     keypoint_network: KeypointForward
@@ -40,7 +44,16 @@ class PaperEstimator:
         return False
 
     def estimate(self, image: UInt8[ndarray, "h w *c"], camera: Camera, box: Box | None = None) -> Estimate:
-        """The pose without a covariance. Any pose that the solver returns counts, as in the paper."""
+        """The pose without a covariance. Any pose that the solver returns counts, as in the paper.
+
+        Args:
+            image: uint8, RGB or grey.
+            camera: The camera of the image.
+            box: About the true keypoints, in px of the image.
+
+        Raises:
+            GknetError: No box is given, or the image is of another kind.
+        """
         if box is None:
             raise GknetError("the paper's protocol: expected the box of the true keypoints, got none")
         crop = Crop.around(box, self.input_size)
@@ -57,7 +70,18 @@ class PaperEstimator:
 
 
 def highest_cells(heatmaps: Float[ndarray, "n h w"], input_size: int) -> Float[ndarray, "n 2"]:
-    """Eq. 5: the centre of the highest of CELLS x CELLS cells, in pixels of the network's input."""
+    """Eq. 5: the centre of the highest of 32 x 32 cells.
+
+    Args:
+        heatmaps: (n, h, h), h a multiple of 32, or less than 32.
+        input_size: Side of the network's input in pixels.
+
+    Returns:
+        (n, 2) in pixels of the network's input.
+
+    Raises:
+        GknetError: h is another number.
+    """
     count, side, _ = heatmaps.shape
     cells = min(CELLS, side)
     if side % cells:
@@ -68,7 +92,16 @@ def highest_cells(heatmaps: Float[ndarray, "n h w"], input_size: int) -> Float[n
 
 
 def plain_pnp(pixels: Float[ndarray, "n 2"], camera: Camera, points_m: Float[ndarray, "n 3"]) -> Pose | None:
-    """EPnP and Levenberg-Marquardt over all keypoints, right or wrong."""
+    """EPnP and Levenberg-Marquardt over all keypoints, outliers included.
+
+    Args:
+        pixels: (n, 2) in the image.
+        camera: The camera of the image, a pinhole.
+        points_m: (n, 3) in the body frame.
+
+    Returns:
+        cam_from_body, or None when OpenCV's solver finds none.
+    """
     try:
         found, turn, shift = cv2.solvePnP(points_m, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_EPNP)
         if not found:

@@ -42,7 +42,7 @@ class AttitudeBins:
     z and x turn about one axis, need no special case: many small cells share what one would have.
 
     Attributes:
-        per_turn: cells to a full turn of an angle, even, 4 or more.
+        per_turn: Cells to a full turn of an angle, even, 4 or more.
     """
 
     per_turn: int = 16
@@ -117,7 +117,7 @@ class AttitudeBins:
         Args:
             probability: (k,) of each cell, summing to 1.
             attitude_wxyz: (4,) unit quaternion, scalar first, any sign.
-            angle_rad: the angle in radians.
+            angle_rad: The angle in radians.
 
         Returns:
             0 to 1.
@@ -144,7 +144,7 @@ class AttitudeBins:
 
         Args:
             points_m: (n, 3) in the body frame.
-            cells: on a side of the crop.
+            cells: On a side of the crop.
 
         Returns:
             (k, n, cells, cells), row by row, each map summing to 1.

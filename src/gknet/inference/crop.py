@@ -26,10 +26,10 @@ class Crop:
     It may reach beyond the image; what lies outside is black.
 
     Attributes:
-        x0: left edge in image pixels.
-        y0: top edge in image pixels.
-        side: side in image pixels.
-        size: side in pixels of the network's input.
+        x0: Left edge in image pixels.
+        y0: Top edge in image pixels.
+        side: Side in image pixels.
+        size: Side in pixels of the network's input.
     """
 
     x0: int
@@ -46,9 +46,9 @@ class Crop:
         """The square about a box.
 
         Args:
-            box: in image pixels.
-            size: side in pixels of the network's input.
-            margin: side of the square over the longer side of the box.
+            box: In image pixels.
+            size: Side in pixels of the network's input.
+            margin: Side of the square over the longer side of the box.
         """
         side = max(8, round(box.side * margin))
         centre_x, centre_y = box.centre

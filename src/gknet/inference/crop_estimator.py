@@ -18,7 +18,7 @@ from gknet.inference.network_io import Forward, check_image
 from gknet.spacecraft import Spacecraft
 
 PLAUSIBLE_SIZE = (0.25, 6.0)
-"""Projected diameter of the spacecraft over the crop's side: small when seen end-on, large when cut off."""
+"""Projected diameter of the spacecraft over the crop's side: small for a view end-on, large when cut off."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class InferenceSettings:
     """How an estimator processes an image.
 
     Attributes:
-        input_size: side in pixels of the input of the network that sees the crop.
-        locator_size: side in pixels of the locator's input.
-        min_located: height of the locator's peak below which there is no spacecraft, 0 to 1.
-        refine_crop: run the network again in a better crop, where the keypoints show that the first one was off.
-        refine_iou: intersection over union of the two crops below which the first one counts as off.
-        tta_rotations: rotations of the crop, 1, 2 or 4, whose heatmaps a keypoint network averages (rotation test-time
+        input_size: Side in pixels of the network's input, into which the crop is resized.
+        locator_size: Side in pixels of the locator's input.
+        min_located: Height of the locator's peak below which there is no spacecraft, 0 to 1.
+        refine_crop: Run the network again in a better crop, where the keypoints show that the first one was off.
+        refine_iou: Intersection over union of the two crops below which the first one counts as off.
+        tta_rotations: Rotations of the crop, 1, 2 or 4, whose heatmaps a keypoint network averages (rotation test-time
             augmentation).
     """
 
@@ -53,9 +53,9 @@ class CropEstimator(ABC):
     Subclasses are dataclasses with these fields, and implement `estimate_in`.
 
     Attributes:
-        spacecraft: the spacecraft whose pose is estimated.
+        spacecraft: The spacecraft whose pose is estimated.
         locator: (b, 3, s, s) -> (b, 5, s / stride, s / stride), see `gknet.inference.locator`; None if boxes are given.
-        settings: how an image is processed.
+        settings: How an image is processed.
     """
 
     spacecraft: Spacecraft
@@ -76,14 +76,14 @@ class CropEstimator(ABC):
 
         Args:
             image: uint8, RGB of shape (h, w, 3) or grey of shape (h, w).
-            camera: the camera of the image; its width and height are the image's.
-            box: where the spacecraft is, in pixels of the image; None lets the locator find it.
+            camera: The camera of the image; its width and height are the image's.
+            box: Where the spacecraft is, in pixels of the image; None lets the locator find it.
 
         Returns:
             The pose, or an `Estimate` whose `failure` states why there is none.
 
         Raises:
-            GknetError: the image is of another kind or size, or there is neither a box nor a locator.
+            GknetError: The image is of another kind or size, or there is neither a box nor a locator.
         """
         image = check_image(image)
         if image.shape[:2] != (camera.height, camera.width):
@@ -109,7 +109,7 @@ class CropEstimator(ABC):
             The box in pixels of the image, None when the locator finds no spacecraft.
 
         Raises:
-            GknetError: the image is of another kind, or there is no locator.
+            GknetError: The image is of another kind, or there is no locator.
         """
         if self.locator is None:
             raise GknetError("estimator: it has no locator; give a box")

@@ -39,7 +39,7 @@ class CropPose:
 
     Attributes:
         offset: (2,) in sides of the crop, x to the right and y down.
-        log_depth: natural logarithm of the depth in the crop's unit.
+        log_depth: Natural logarithm of the depth in the crop's unit.
         attitude_wxyz: (4,) unit quaternion of R_ray^T R, scalar first, any sign.
     """
 
@@ -52,10 +52,10 @@ class CropPose:
         """How a crop shows a pose.
 
         Args:
-            pose: cam_from_body.
-            camera: the camera of the full image.
-            crop: the crop of the image.
-            diameter_m: of the spacecraft.
+            pose: Cam_from_body.
+            camera: The camera of the full image.
+            crop: The crop of the image.
+            diameter_m: Of the spacecraft.
 
         Returns:
             None when the body's origin is not in front of the camera.
@@ -80,8 +80,8 @@ class CropPose:
 
         Args:
             input_from_crop: (3, 3) similarity, pixels of the crop to pixels of the other square.
-            crop_size: side of the crop's pixels.
-            input_size: side of the other square's.
+            crop_size: Side of the crop's pixels.
+            input_size: Side of the other square's.
         """
         linear = input_from_crop[:2, :2]
         pixel = linear @ ((self.offset + 0.5) * crop_size) + input_from_crop[:2, 2]
@@ -129,9 +129,9 @@ def attitude_confidence(
     """The probability of the attitudes within `NEAR_RAD` of a pose's.
 
     Args:
-        pose: cam_from_body.
+        pose: Cam_from_body.
         probability: (k,) of each attitude class, summing to 1.
-        bins: the classes.
+        bins: The classes.
 
     Returns:
         0 to 1; None without probabilities or classes.

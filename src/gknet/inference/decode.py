@@ -37,8 +37,8 @@ class Decoding:
     """How a peak's height and width become a covariance. Both numbers are fitted on a validation split (calibration).
 
     Attributes:
-        floor_cells: standard deviation per axis of a perfect peak, in cells of the heatmap.
-        spread_scale: factor on the covariance that follows from a peak's height and width.
+        floor_cells: Standard deviation per axis of a perfect peak, in cells of the heatmap.
+        spread_scale: Factor on the covariance that follows from a peak's height and width.
     """
 
     floor_cells: float = 0.3
@@ -56,15 +56,15 @@ def decode_heatmaps(heatmaps: Float[ndarray, "n h w"], stride: float, decoding: 
 
     Args:
         heatmaps: (n, h, w), h and w of 3 or more.
-        stride: pixels of the network's input per cell.
-        decoding: how a peak becomes a covariance; None for the uncalibrated default.
+        stride: Pixels of the network's input per cell.
+        decoding: How a peak becomes a covariance; None for the uncalibrated default.
 
     Returns:
         Keypoints in pixels of the network's input. A heatmap without a peak (flat, or not finite) yields score 0, the
         centre of the input and the covariance of a point that may be anywhere in it.
 
     Raises:
-        GknetError: the heatmaps have another shape.
+        GknetError: The heatmaps have another shape.
     """
     decoding = decoding or Decoding()
     if heatmaps.ndim != 3 or heatmaps.shape[1] < 3 or heatmaps.shape[2] < 3:

@@ -27,13 +27,13 @@ def decode_output(output: Float[ndarray, " c"], bins: AttitudeBins) -> CropPose 
 
     Args:
         output: (3 + bins.count,): offset x and y, log_depth, then the probability of each attitude class.
-        bins: the attitude classes.
+        bins: The attitude classes.
 
     Returns:
         None when a number is not finite.
 
     Raises:
-        GknetError: the row has another length.
+        GknetError: The row has another length.
     """
     if output.shape != (3 + bins.count,):
         raise GknetError(f"direct network: expected {3 + bins.count} numbers for a crop, got shape {output.shape}")
@@ -50,10 +50,10 @@ class DirectEstimator(CropEstimator):
 
     Attributes:
         network: (b, 3, s, s) -> (b, 3 + bins.count), see `decode_output`.
-        spacecraft: the spacecraft whose pose is estimated.
-        bins: the attitude classes.
-        locator: finds the box; None if boxes are given.
-        settings: how an image is processed.
+        spacecraft: The spacecraft whose pose is estimated.
+        bins: The attitude classes.
+        locator: Finds the box; None if boxes are given.
+        settings: How an image is processed.
     """
 
     network: Forward

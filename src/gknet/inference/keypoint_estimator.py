@@ -31,12 +31,12 @@ class KeypointEstimator(CropEstimator):
     Attributes:
         keypoint_network: (b, 3, s, s) -> heatmaps (b, n, s / stride, s / stride), channel k is keypoint k, and perhaps
             probabilities of attitude classes.
-        spacecraft: the spacecraft whose pose is estimated.
-        locator: finds the box; None if boxes are given.
-        settings: how an image is processed.
-        decoding: how heatmaps become keypoints with covariances.
-        pnp: when a pose is accepted.
-        bins: the attitude classes; None for a network without them.
+        spacecraft: The spacecraft whose pose is estimated.
+        locator: Finds the box; None if boxes are given.
+        settings: How an image is processed.
+        decoding: How heatmaps become keypoints with covariances.
+        pnp: When a pose is accepted.
+        bins: The attitude classes; None for a network without them.
     """
 
     keypoint_network: KeypointForward
@@ -63,15 +63,15 @@ class KeypointEstimator(CropEstimator):
         """Detect the keypoints in a crop.
 
         Args:
-            image: the full image, RGB.
-            crop: the part that the network sees.
+            image: The full image, RGB.
+            crop: The part that is the network's input.
 
         Returns:
             The keypoints in pixels of the full image, and the probabilities (k,) of the attitude classes, None for a
             network without them.
 
         Raises:
-            GknetError: the network has another number of heatmaps or classes than the spacecraft and `bins`.
+            GknetError: The network has another number of heatmaps or classes than the spacecraft and `bins`.
         """
         heatmaps, attitude = self._averaged_output(network_input(image, crop))
         if len(heatmaps) != self.spacecraft.keypoint_count:
@@ -106,12 +106,12 @@ class KeypointEstimator(CropEstimator):
         """The pose that explains keypoints detected in a crop, or why there is none.
 
         Args:
-            keypoints: in pixels of the full image.
-            camera: the camera of the full image.
-            box: where the spacecraft was found.
-            crop: where the keypoints were detected.
+            keypoints: In pixels of the full image.
+            camera: The camera of the full image.
+            box: Where the spacecraft was found.
+            crop: Where the keypoints were detected.
             attitude: (k,) probabilities of the attitude classes, from that crop.
-            trust_box: whether the box is a measurement of the pose; not one that the keypoints contradicted.
+            trust_box: Whether the box is a measurement of the pose; not one that the keypoints contradicted.
         """
         measured = box if trust_box else None
         result = solve_pnp(keypoints, camera, self.spacecraft.points_m, 1 / crop.scale, self.pnp, measured)

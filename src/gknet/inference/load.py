@@ -32,10 +32,10 @@ def shipped_folder(name: str) -> Path:
     """The folder of a shipped model, whatever the current folder holds.
 
     Args:
-        name: one of `shipped_models`.
+        name: One of `shipped_models`.
 
     Raises:
-        GknetError: no such model is shipped.
+        GknetError: No such model is shipped.
     """
     if name not in shipped_models():
         known = ", ".join(shipped_models()) or "none"
@@ -49,9 +49,9 @@ def load_estimator(
     """Load an estimator.
 
     Args:
-        name_or_folder: the name of a shipped model (`shipped_models`), or a folder with keypoints.onnx or direct.onnx,
+        name_or_folder: The name of a shipped model (`shipped_models`), or a folder with keypoints.onnx or direct.onnx,
             and perhaps a locator.onnx. A `Path`, and a string with a path separator, is a folder always.
-        threads: of one call of a network, 1 to 1024; None leaves the choice to onnxruntime (every core).
+        threads: Of one call of a network, 1 to 1024; None leaves the choice to onnxruntime (every core).
         device: "cpu", or "cuda" with the package onnxruntime-gpu.
         tta_rotations: `InferenceSettings.tta_rotations`: 1, 2 or 4.
 
@@ -59,7 +59,7 @@ def load_estimator(
         A `PoseEstimator`. With a locator it needs no box.
 
     Raises:
-        GknetError: no such model; a name that is both a shipped model and a folder here; files that are not gknet's, or
+        GknetError: No such model; a name that is both a shipped model and a folder here; files that are not gknet's, or
             of different spacecraft; an argument out of range.
     """
     folder = _folder_of(name_or_folder)
@@ -80,7 +80,7 @@ def load_estimator(
     if kinds[0] == "direct":
         assert bins is not None  # by its metadata
         if tta_rotations > 1:
-            raise GknetError(f"tta_rotations: a direct network sees the crop upright alone, got {tta_rotations}")
+            raise GknetError(f"tta_rotations: expected 1 for a direct network, got {tta_rotations}")
         return DirectEstimator(network, network.spacecraft, bins, locator, settings)
     return KeypointEstimator(
         network.predict,

@@ -16,10 +16,10 @@ def locate(image: UInt8[ndarray, "h w 3"], network: Forward, input_size: int, mi
     """Find the spacecraft in an image.
 
     Args:
-        image: the full image, RGB. The network sees it scaled, in the middle of a black square.
+        image: The full image, RGB. The network's input is this image scaled, in the middle of a black square.
         network: (b, 3, s, s) -> (b, 5, s / stride, s / stride), see `decode_locator`.
-        input_size: side of the network's input in pixels.
-        min_score: height of the centre's peak below which there is no spacecraft.
+        input_size: Side of the network's input in pixels.
+        min_score: Height of the centre's peak below which there is no spacecraft.
 
     Returns:
         The part of the box inside the image, in its pixels, or None when no spacecraft is found.
@@ -42,19 +42,19 @@ def decode_locator(
     """A locator's maps as a box.
 
     Args:
-        output: channel 0 is the heatmap of the box's centre; channels 1 to 4 are the distances from a cell's centre to
+        output: Channel 0 is the heatmap of the box's centre; channels 1 to 4 are the distances from a cell's centre to
             the left, top, right and bottom side, in units of the input's size. The sides are averaged over the cells
             about the peak.
-        stride: input pixels per cell.
-        input_size: side of the network's input in pixels.
-        min_score: height of the peak below which there is no spacecraft.
+        stride: Input pixels per cell.
+        input_size: Side of the network's input in pixels.
+        min_score: Height of the peak below which there is no spacecraft.
 
     Returns:
         The box in pixels of the network's input, and the height of its peak (0 to 1); None when no peak is high enough,
         the box is empty, or the output is not finite.
 
     Raises:
-        GknetError: the output has another shape.
+        GknetError: The output has another shape.
     """
     if output.ndim != 3 or output.shape[0] != 5:
         raise GknetError(f"locator output: expected shape (5, h, w), got {output.shape}")

@@ -40,7 +40,7 @@ def check_image(image: object) -> UInt8[ndarray, "h w 3"]:
         image: uint8, RGB of shape (h, w, 3) or grey of shape (h, w), which is repeated into three channels.
 
     Raises:
-        GknetError: anything else.
+        GknetError: Anything else.
     """
     if not isinstance(image, ndarray) or image.dtype != np.uint8:
         kind = image.dtype if isinstance(image, ndarray) else type(image).__name__

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gknet.errors import GknetError
 from gknet.frame import Box, Failure, FailureKind, Keypoints
-from gknet.geometry import Camera, Pose
+from gknet.geometry import LARGEST_PX, Camera, Pose
 from gknet.inference.refine_pose import BoxEdges, PnpProblem, covariance_of, refine, residuals_px
 
 
@@ -26,7 +26,7 @@ class PnpSettings:
         min_score: Keypoints with a lower score are not used.
         threshold_px: A keypoint nearer than this to its projection is an inlier; tried in order until a pose is found.
         min_inliers: The fewest inliers of a pose,
-        min_inlier_fraction: and the smallest part of the keypoints used that they are.
+        min_inlier_fraction: And the smallest part of the keypoints used that they are.
         max_rms_px: Of the inliers' reprojection errors.
         box_sigma: Standard deviation of a side of the spacecraft's box, in parts of the box's longer side.
         max_box_ratio: Of the pose's extent to the box's along the box's longer side, either way, for a pose that less
@@ -154,12 +154,13 @@ def _against_box(problem: PnpProblem, edges: BoxEdges, result: PnpResult, max_ra
 
 
 def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, " n"]:
-    finite = np.isfinite(keypoints.pixels).all(axis=1) & np.isfinite(keypoints.covariance_px2).all(axis=(1, 2))
-    return (
-        finite
-        & (keypoints.score >= min_score)
-        & (np.linalg.det(np.where(finite[:, None, None], keypoints.covariance_px2, 0.0)) > 0)
+    """Keypoints with a sufficient score whose position and covariance are numbers that a picture can have."""
+    covariance = keypoints.covariance_px2
+    known = (np.abs(keypoints.pixels) <= LARGEST_PX).all(axis=1) & (np.abs(covariance) <= LARGEST_PX**2).all(
+        axis=(1, 2)
     )
+    known[known] = np.linalg.det(covariance[known]) > 0
+    return known & (keypoints.score >= min_score)
 
 
 def _solve(
