@@ -43,7 +43,7 @@ def panel_corners(columns: int, rows: int) -> Float[ndarray, "4 3"]:
 
 
 def panel(model: Model, part: str, at: Float[ndarray, "4 4"], columns: int, rows: int, cells: Material) -> None:
-    """A solar panel centred on its frame: x along the columns, y along the rows, the cells look to +z."""
+    """A solar panel centred on its frame: x along the columns, y along the rows, the cells face +z."""
     width, length = panel_size(columns, rows)
     sheet = (columns * CELL_M[0], rows * CELL_M[1], 0.004)
     top = THICKNESS_M / 2
@@ -176,7 +176,7 @@ def helix_antenna(model: Model, part: str, at: Float[ndarray, "4 4"], height: fl
 def dish_antenna(
     model: Model, part: str, at: Float[ndarray, "4 4"], radius: float, depth: float, focus: float
 ) -> Float[ndarray, "3"]:
-    """A white dish that looks along +z from the origin, with feed and struts. Returns the feed's outer tip."""
+    """A white dish at the origin that faces +z, with feed and struts. Returns the outer tip of the feed (body, m)."""
     model.add(part, m.white_paint(), s.dish(radius, depth), at=at)
     spokes = [
         s.rod(
@@ -211,7 +211,7 @@ def dish_antenna(
 
 
 def blanket(model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[float, float], material: Material) -> None:
-    """A padded foil blanket on a wall that looks to +z, held by buttons."""
+    """A padded foil blanket on a wall that faces +z, held by buttons."""
     width, height = size
     model.add(part, material, s.box((width, height, 0.05), (0, 0, 0.0), 0.022, 4), at=at)
     columns, rows = max(2, round(width / 0.3)), max(2, round(height / 0.3))
@@ -226,7 +226,7 @@ def blanket(model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[floa
 
 
 def radiator(model: Model, part: str, at: Float[ndarray, "4 4"], size: tuple[float, float]) -> None:
-    """A plate of mirror tiles on a wall that looks to +z, in an aluminium frame."""
+    """A plate of mirror tiles on a wall that faces +z, in an aluminium frame."""
     width, height = size
     model.add(part, m.mirror_tiles(), s.box((width, height, 0.024), (0, 0, 0.012), 0.003, 2), at=at)
     bars = [s.box((width + 0.05, 0.025, 0.034), (0, y, 0.012), 0.004, 2) for y in _ends(height / 2 + 0.0125)]

@@ -141,7 +141,7 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Float[ndarray, "c 3"]:
 
 
 def _flat(mesh: trimesh.Trimesh) -> Float[ndarray, "c 2"]:
-    """Metres on the side of a box that each face looks to, for each corner."""
+    """Metres on the side of a box that each face points to, for each corner."""
     axis = np.argmax(np.abs(mesh.face_normals) + np.array([0, 1e-6, 2e-6]), axis=1)
     return _planar(mesh.triangles, axis, mesh.face_normals)
 
@@ -158,7 +158,7 @@ def _planar(
 
 
 def _wrapped(mesh: trimesh.Trimesh) -> Float[ndarray, "c 2"]:
-    """Metres around and along the z axis, for each corner; faces that look along z are laid flat."""
+    """Metres around and along the z axis, for each corner; faces whose normal is near z are laid flat."""
     triangles, normals = mesh.triangles, mesh.face_normals
     angle = np.arctan2(triangles[..., 1], triangles[..., 0])
     middle = triangles.mean(axis=1)

@@ -1,6 +1,6 @@
 """Satellite_02: a square bus with four equal wings in a cross, tanks and ring frames at both ends.
 
-A quarter turn about z hardly changes its shape; what tells its sides apart is on the outside of it: bluer cells and a
+A quarter turn about z hardly changes its shape; what distinguishes its sides is on the outside: bluer cells and a
 white tip on the +x wing, a red tip and a whip on the +y wing, a dark patch on -x, one star tracker on -y.
 """
 
@@ -63,7 +63,7 @@ def _bus(model: Model) -> None:
 
 
 def _wing(model: Model, name: str, out: Float[ndarray, "3"]) -> None:
-    """Panels in the xy plane, cells up; `left` and `right` are seen looking outward, head towards +z."""
+    """Panels in the xy plane, cells up; `left` and `right` as for a viewer at the hub who faces outward, +z up."""
     root = frame(out * (HALF[0] + 0.02), (0, 0, 1), np.cross(out, (0, 0, 1)))
     width, length = f.panel_size(COLUMNS, ROWS)
     part = f"wing_{name}"
@@ -169,7 +169,7 @@ def _marks(model: Model) -> None:
 
 
 def _tip_band(width: float, depth: float = 0.13) -> trimesh.Trimesh:
-    """A painted sleeve along x over a wing whose end is at y = 0; seen from both faces."""
+    """A painted sleeve along x over a wing whose end is at y = 0; visible from both faces."""
     return s.box((width - 0.05, depth, f.THICKNESS_M + 0.012), (0, -depth / 2 - 0.003, 0), 0.004)
 
 

@@ -193,7 +193,7 @@ def _floor(model: Model) -> None:
 
 
 def _panel(model: Model) -> None:
-    """One panel on the -x side, its cells looking down."""
+    """One panel on the -x side, its cells facing down."""
     columns, rows = 8, 6
     length = f.panel_size(columns, rows)[1]
     root = frame((-BUS_HALF - 0.02, 0, -0.98), (0.55, 0, -1), (0, -1, 0))

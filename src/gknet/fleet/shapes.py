@@ -31,6 +31,7 @@ def frame(origin: Point = (0, 0, 0), z: Point = (0, 0, 1), x: Point = (1, 0, 0))
 
 
 def moved(mesh: trimesh.Trimesh, body_from_local: Float[ndarray, "4 4"]) -> trimesh.Trimesh:
+    """A copy of the mesh, from its local frame into the body frame."""
     copy = mesh.copy()
     copy.apply_transform(body_from_local)
     return copy
@@ -42,6 +43,7 @@ def point_of(body_from_local: Float[ndarray, "4 4"], point: Point) -> Float[ndar
 
 
 def joined(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Several meshes as one."""
     return cast(trimesh.Trimesh, concatenate(list(meshes)))
 
 
@@ -96,7 +98,7 @@ def cylinder(radius: float, z0: float, z1: float, sections: int = 32, bevel: flo
 
 
 def spike(radius: float, z0: float, z1: float, sections: int = 16) -> trimesh.Trimesh:
-    """A rod about z that ends in a slender point at z1, which is seen from nearly everywhere."""
+    """A rod about z that ends in a slender point at z1, which is visible from nearly everywhere."""
     return turned([(0, z0), (radius, z0), (radius, z1 - 5 * radius), (0, z1)], sections)
 
 

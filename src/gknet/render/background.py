@@ -42,7 +42,15 @@ _FINE_SCALE = 0.5
 
 
 def background(shot: Shot, window: Crop) -> Float32[ndarray, "s s 3"]:
-    """What the window would show without the spacecraft."""
+    """What the window would show without the spacecraft.
+
+    Args:
+        shot: The frame.
+        window: A square of its full image; the picture has `s = window.size` pixels a side.
+
+    Returns:
+        (s, s, 3) linear RGB radiance.
+    """
     picture = np.zeros((window.size, window.size, 3), dtype=np.float32)
     add_stars(picture, shot.camera, window, shot.cam_from_inertial)
     _add_sun(picture, shot, window)

@@ -1,4 +1,4 @@
-"""A grid of rendered frames with their labels drawn in, to look at before anything is trained on them."""
+"""A grid of rendered frames with their labels drawn in, for a check by eye before anything is trained on them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,21 @@ from gknet.spacecraft import Spacecraft
 TILE_PX = 256
 COLUMNS = 8
 TILES = 40
-SEEN, HIDDEN, BONE = (80, 255, 80), (255, 90, 60), (90, 160, 255)
+VISIBLE, HIDDEN, EDGE = (80, 255, 80), (255, 90, 60), (90, 160, 255)
 SUBPIXEL_BITS = 4
 
 
 def write_contact_sheet(root: str | Path, tiles: int = TILES) -> Path | None:
-    """contact_sheet.jpg in a rendered folder: up to `tiles` frames spread over its spacecraft and sequences.
+    """Write contact_sheet.jpg: frames spread over the spacecraft and sequences of a rendered folder.
 
-    Visible keypoints are green dots, hidden ones red rings. None when there is no frame to show.
+    Visible keypoints are green dots, hidden ones red rings.
+
+    Args:
+        root: The dataset's folder.
+        tiles: The largest number of frames.
+
+    Returns:
+        The sheet's path, None when there is no frame to show.
     """
     root = Path(root)
     pictures = [_tile(frame, craft) for frame, craft in _chosen(root, tiles)]
@@ -64,12 +71,12 @@ def _tile(frame: Frame, spacecraft: Spacecraft) -> UInt8[ndarray, "t t 3"]:
     for i, j in spacecraft.edges:
         start, stop = ends[i], ends[j]
         if start and stop:
-            cv2.line(picture, start, stop, BONE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+            cv2.line(picture, start, stop, EDGE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
     for k, end in enumerate(ends):
-        seen = frame.visible is None or frame.visible[k]
+        is_visible = frame.visible is None or frame.visible[k]
         if end:
             radius = round(2.2 * 2**SUBPIXEL_BITS)
-            colour, width = (SEEN, cv2.FILLED) if seen else (HIDDEN, 1)
+            colour, width = (VISIBLE, cv2.FILLED) if is_visible else (HIDDEN, 1)
             cv2.circle(picture, end, radius, colour, width, cv2.LINE_AA, SUBPIXEL_BITS)
     label = f"{frame.name}  {frame.range_m:.1f} m"
     cv2.putText(picture, label, (4, TILE_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (255, 255, 0), 1, cv2.LINE_AA)

@@ -31,16 +31,24 @@ CLOUD_ALBEDO = 0.8
 
 @dataclass(frozen=True, eq=False)
 class EarthSurface:
-    """Albedo (linear RGB) of ground and clouds together, and how far it is open water (0 to 1)."""
+    """The ground with its clouds.
+
+    Attributes:
+        albedo: (h, w, 3) linear RGB of both together.
+        water: (h, w) part that is open water, 0 to 1.
+    """
 
     albedo: Float32[ndarray, "h w 3"]
     water: Float32[ndarray, "h w"]
 
 
 def earth_surface(point: Float32[ndarray, "h w 3"], below: Float[ndarray, "3"], sequence: int) -> EarthSurface:
-    """The Earth at unit vectors in Earth-fixed axes; the weather is the sequence's.
+    """The Earth at given points.
 
-    `below` is the point below the camera.
+    Args:
+        point: (h, w, 3) unit vectors in Earth-fixed axes.
+        below: (3,) the unit vector of the point below the camera.
+        sequence: Its number decides the weather.
     """
     texture = earth_texture()
     rows, columns = texture.shape[:2]

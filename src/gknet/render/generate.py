@@ -87,8 +87,8 @@ def generate(
         What was done. Frames that failed are reported there.
 
     Raises:
-        GknetError: `out` was made with other options, the selection has no frame, a mesh is not what its spacecraft's
-            file says, or a worker process died.
+        GknetError: `out` was made with other options, the selection has no frame, a mesh has not the size
+            that its spacecraft's file declares, or a worker process died.
         MissingExtraError: The extra `render` is not installed.
         Interrupted: A stop signal came.
     """

@@ -59,7 +59,7 @@ class MeshPart:
 
     Attributes:
         vertices_m: (v, 3) in the body frame, in m.
-        faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
+        faces: (f, 3) indices of vertices, counter-clockwise from outside.
         normals: (v, 3) unit vectors in the body frame; None for flat shading.
         uv: (v, 2) texture coordinates with the origin at the texture's top left, as in glTF; None without textures.
         colours: (v, 3) linear RGB of the vertices; None when the material has the colour.
@@ -141,7 +141,7 @@ def _read(path: Path) -> bytes:
 
 
 def check_scale(spacecraft: Spacecraft, parts: list[MeshPart]) -> None:
-    """Hold a mesh against what its spacecraft's file says of it.
+    """Hold a mesh against the diameter and the keypoints of its spacecraft.
 
     Args:
         spacecraft: Its `diameter_m` and its keypoints are compared with the mesh.

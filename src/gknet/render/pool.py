@@ -22,7 +22,7 @@ from gknet.render.plan import Job, SequencePlan
 from gknet.render.worker import Outcome, WorkerState, render_chunk
 
 MOST_WORKERS = 256
-_LOOK_EVERY_S = 0.2
+_POLL_S = 0.2
 _SIGNAL_ON_ITS_WAY_S = 1.0
 
 
@@ -60,7 +60,7 @@ def render_chunks(
         # A signal to the whole process group ends the workers too; this process may get it a moment later.
         deadline = time.monotonic() + _SIGNAL_ON_ITS_WAY_S
         while not interruption.requested and time.monotonic() < deadline:
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
         if not interruption.requested:
             raise GknetError(
                 "a rendering process died (out of memory, or Mitsuba aborted); run the same command again to go on, "
@@ -91,7 +91,7 @@ def _outcomes(
                     running.add(executor.submit(_work, chunk))
         if not running:
             return
-        finished, running = wait(running, timeout=_LOOK_EVERY_S, return_when=FIRST_COMPLETED)
+        finished, running = wait(running, timeout=_POLL_S, return_when=FIRST_COMPLETED)
         yield from (future.result() for future in finished)
 
 
@@ -115,7 +115,7 @@ _stop: Event | None = None
 def _start_worker(job: Job, variant: str, stop: Event, lifeline: Connection) -> None:
     """Called once in each worker process: one thread each, and a state of its own."""
     global _state, _stop
-    os.dup2(2, 1)  # whoever reads the standard output of the command waits for no worker
+    os.dup2(2, 1)  # a reader of the command's standard output does not wait for workers
     cv2.setNumThreads(1)
     _state, _stop = WorkerState(job, variant, threads=1), stop
     Thread(target=_end_with, args=(lifeline, _state), daemon=True).start()

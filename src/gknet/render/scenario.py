@@ -1,4 +1,4 @@
-"""What the camera meets in frame `index` of sequence `sequence`: a pure function of (recipe, seed, sequence, index)."""
+"""The scene of one frame: a pure function of (recipe, spacecraft, seed, sequence, index)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ __all__ = ["CAMERA", "EARTH_RADIUS_M", "RECIPES", "EarthView", "Recipe", "Sensor
 
 @dataclass(frozen=True, eq=False)
 class EarthView:
-    """Where the Earth is. Earth-fixed axes: z to the north pole, x to longitude 0, y to longitude 90 degrees east."""
+    """Where the Earth is. Earth-fixed axes: z to the north pole, x to longitude 0, y to longitude 90 degrees east.
+
+    Attributes:
+        centre_cam_m: (3,) its centre in the camera frame, in m.
+        cam_from_earth: (3, 3) rotation from Earth-fixed axes to the camera frame.
+    """
 
     centre_cam_m: Float[ndarray, "3"]
     cam_from_earth: Float[ndarray, "3 3"]
@@ -31,11 +36,20 @@ class EarthView:
 class Shot:
     """One frame before light: all that the renderer, the background and the sensor need.
 
-    sun_direction       unit vector to the sun, camera frame
-    earth               None when no part of the Earth is in view
-    cam_from_inertial   inertial axes are equatorial, those of the star catalogue
-    seed                of this frame's noise
-    planet              the Earth whether in view or not (its light reaches the spacecraft all the same)
+    Attributes:
+        recipe: Its name.
+        spacecraft: Its name.
+        sequence: Number of the sequence, from 0.
+        index: Number of the frame in it, from 0.
+        time_s: Since the sequence's first frame, in s.
+        camera: Of the whole sensor.
+        cam_from_body: The pose, in m, in the OpenCV camera frame.
+        sun_direction: (3,) unit vector to the sun in the camera frame.
+        earth: None when no part of the Earth is in view.
+        cam_from_inertial: (3, 3) rotation; inertial axes are equatorial, those of the star catalogue.
+        sensor: Detector and exposure.
+        seed: Of this frame's noise.
+        planet: The Earth, whether in view or not: its light reaches the spacecraft in any case.
     """
 
     recipe: str
@@ -54,32 +68,45 @@ class Shot:
 
 
 def shoot(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int, index: int) -> Shot:
-    """The shot of one frame, in any order. The sequence's motion is solved once and remembered for the next frames."""
+    """The shot of one frame; frames may be asked for in any order.
+
+    The sequence's motion is sampled once and kept for the next frames.
+
+    Args:
+        recipe: The ranges.
+        spacecraft: The sequence's.
+        seed: Of the dataset.
+        sequence: From 0.
+        index: Of the frame, from 0.
+
+    Raises:
+        GknetError: The recipe has no such frame, or no motion obeys its limits.
+    """
     if not 0 <= sequence < recipe.sequences:
         raise GknetError(f"sequence: expected 0 to {recipe.sequences - 1} in recipe {recipe.name}, got {sequence}")
     if not 0 <= index < recipe.frames:
         raise GknetError(f"frame: expected 0 to {recipe.frames - 1} in recipe {recipe.name}, got {index}")
-    solved = sample_sequence(recipe, spacecraft, seed, sequence)
-    planet = EarthView(solved.earth_centre_cam_m[index], solved.cam_from_earth[index])
+    motion = sample_sequence(recipe, spacecraft, seed, sequence)
+    planet = EarthView(motion.earth_centre_cam_m[index], motion.cam_from_earth[index])
     noise_seed = np.random.SeedSequence([seed, recipe.key, sequence, index]).generate_state(1)[0]
     return Shot(
         recipe=recipe.name,
         spacecraft=spacecraft.name,
         sequence=sequence,
         index=index,
-        time_s=float(solved.time_s[index]),
+        time_s=float(motion.time_s[index]),
         camera=CAMERA,
-        cam_from_body=Pose(solved.cam_from_body[index], solved.body_cam_m[index]),
-        sun_direction=solved.sun_direction[index],
-        earth=planet if solved.earth_in_view[index] else None,
-        cam_from_inertial=solved.cam_from_inertial[index],
-        sensor=_sensor(recipe, solved, seed, sequence, index),
+        cam_from_body=Pose(motion.cam_from_body[index], motion.body_cam_m[index]),
+        sun_direction=motion.sun_direction[index],
+        earth=planet if motion.earth_in_view[index] else None,
+        cam_from_inertial=motion.cam_from_inertial[index],
+        sensor=_sensor(recipe, motion, seed, sequence, index),
         seed=int(noise_seed) >> 1,
         planet=planet,
     )
 
 
-def _sensor(recipe: Recipe, solved: SequenceMotion, seed: int, sequence: int, index: int) -> Sensor:
+def _sensor(recipe: Recipe, motion: SequenceMotion, seed: int, sequence: int, index: int) -> Sensor:
     """A camera for the sequence, an exposure for the frame."""
     detector = recipe.detector
     rng = np.random.default_rng([seed, recipe.key, sequence, 2**31])
@@ -90,15 +117,15 @@ def _sensor(recipe: Recipe, solved: SequenceMotion, seed: int, sequence: int, in
     error = np.exp(detector.exposure_sigma * rng.standard_normal())
     if rng.random() < detector.exposure_failure:
         error *= log_uniform(detector.failure_factor) ** rng.choice((-1, 1))
-    drift = np.exp(0.3 * detector.exposure_sigma * band_limited(solved.time_s, rng, (30.0, 300.0))[index])
-    metered = _metered_radiance(float(solved.phase_rad[index]), bool(solved.earth_in_view[index]))
+    drift = np.exp(0.3 * detector.exposure_sigma * band_limited(motion.time_s, rng, (30.0, 300.0))[index])
+    metered = _metered_radiance(float(motion.phase_rad[index]), bool(motion.earth_in_view[index]))
     return Sensor(
         psf_sigma_px=log_uniform(detector.psf_sigma_px),
         exposure=float(metered * error * drift),
         full_well_e=log_uniform(detector.full_well_e),
         read_noise_e=log_uniform(detector.read_noise_e),
         bloom=log_uniform(detector.bloom),
-        veil=log_uniform(detector.veil) * _sun_veil(solved.sun_direction[index]),
+        veil=log_uniform(detector.veil) * _sun_veil(motion.sun_direction[index]),
         gamma=rng.uniform(*detector.gamma),
         monochrome=bool(rng.random() < detector.monochrome),
         jpeg_quality=int(rng.integers(detector.jpeg_quality[0], detector.jpeg_quality[1], endpoint=True)),

@@ -123,7 +123,11 @@ class Renderer:
 
 
 def light_of(shot: Shot) -> IncidentLight:
-    """The sun, the Earth and a faint sky as the spacecraft of a shot meets them, in its body frame."""
+    """The light that falls on the spacecraft of a shot, in its body frame.
+
+    Raises:
+        GknetError: The spacecraft is inside the Earth.
+    """
     rotation = shot.cam_from_body.rotation
     sun = np.asarray(shot.sun_direction, dtype=np.float64)
     centre = None

@@ -29,15 +29,16 @@ _LEVELS = 1 << 14
 class Sensor:
     """One frame's camera and exposure; widths in native pixels.
 
-    psf_sigma_px   Gaussian point spread
-    exposure       the radiance that fills a pixel (1 = a white surface facing the full sun)
-    full_well_e    electrons of a full pixel
-    read_noise_e   standard deviation of the read-out, electrons
-    bloom          part of the light that scatters into a wide halo
-    veil           stray light of the sun over the whole picture, in radiance
-    gamma          pixel = 255 signal^(1 / gamma)
-    monochrome     one luminance for the three channels
-    jpeg_quality   for whoever writes the file
+    Attributes:
+        psf_sigma_px: Gaussian point spread.
+        exposure: The radiance that fills a pixel (1 = a white surface that faces the full sun).
+        full_well_e: Electrons of a full pixel.
+        read_noise_e: Standard deviation of the read-out noise, in electrons.
+        bloom: Part of the light that scatters into a wide halo.
+        veil: Stray light of the sun over the whole picture, in radiance.
+        gamma: Pixel = 255 signal^(1 / gamma).
+        monochrome: Whether the three channels have one luminance.
+        jpeg_quality: Of the file, 1 to 100.
     """
 
     psf_sigma_px: float
@@ -52,10 +53,21 @@ class Sensor:
 
 
 def expose(radiance: Float[ndarray, "h w 3"], sensor: Sensor, scale: float, seed: int) -> UInt8[ndarray, "h w 3"]:
-    """The picture of `radiance` (linear RGB), deterministic by `seed`.
+    """The picture that the sensor makes of light; the same arguments give the same picture.
 
-    `scale` is the window's pixels per native pixel. Above 1 the noise is that of one native pixel. Shot noise is
-    taken as Gaussian: below some 20 electrons, where it is not, the read noise covers it.
+    Shot noise is taken as Gaussian: below some 20 electrons, where it is not, the read noise covers it.
+
+    Args:
+        radiance: (h, w, 3) linear RGB, 1 = a white surface that faces the full sun.
+        sensor: Detector and exposure.
+        scale: The window's pixels per native pixel. Above 1 the noise is that of one native pixel.
+        seed: Of the noise.
+
+    Returns:
+        (h, w, 3) uint8 RGB.
+
+    Raises:
+        GknetError: `scale` is not positive.
     """
     if not scale > 0:
         raise GknetError(f"scale: expected a positive number of pixels per native pixel, got {scale}")

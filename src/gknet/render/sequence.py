@@ -1,6 +1,6 @@
-"""One sequence of a recipe, solved as a whole: candidates are drawn until every frame obeys the recipe's limits.
+"""One sequence of a recipe, sampled as a whole: candidates are drawn until every frame obeys the recipe's limits.
 
-What a sequence is about (kind of motion, Earth, phase angle) is spread evenly over the sequences of a spacecraft before
+What a sequence shows (kind of motion, Earth, phase angle) is spread evenly over the sequences of a spacecraft before
 any candidate is drawn, so that rejection cannot skew it.
 """
 
@@ -46,7 +46,13 @@ _EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 
 @dataclass(frozen=True)
 class SequenceSpec:
-    """What a sequence is about."""
+    """What a sequence shows.
+
+    Attributes:
+        kind: Of the chaser's motion.
+        scene: What is behind the spacecraft.
+        phase_rad: Angle at the spacecraft between the sun and the camera at mid-sequence, in rad.
+    """
 
     kind: Kind
     scene: Scene
@@ -55,7 +61,20 @@ class SequenceSpec:
 
 @dataclass(frozen=True, eq=False)
 class SequenceMotion:
-    """The geometry of a sequence's `t` frames."""
+    """The geometry of a sequence's `t` frames, camera frame in OpenCV axes.
+
+    Attributes:
+        spec: What was asked for.
+        time_s: (t,) since the first frame, in s.
+        cam_from_body: (t, 3, 3) rotations.
+        body_cam_m: (t, 3) origin of the body frame in the camera frame, in m.
+        cam_from_inertial: (t, 3, 3) rotations from equatorial axes.
+        cam_from_earth: (t, 3, 3) rotations from Earth-fixed axes.
+        earth_centre_cam_m: (t, 3) in the camera frame, in m.
+        earth_in_view: (t,) whether a part of the Earth is in the full image.
+        sun_direction: (t, 3) unit vectors to the sun in the camera frame.
+        phase_rad: (t,) angles at the spacecraft between the sun and the camera, in rad.
+    """
 
     spec: SequenceSpec
     time_s: Float[ndarray, " t"]
@@ -71,7 +90,7 @@ class SequenceMotion:
 
 @dataclass(frozen=True, eq=False)
 class _Orbit:
-    """The spacecraft's orbit: LVLH at each time, and the Earth's angular radius seen from it."""
+    """The spacecraft's orbit: LVLH at each time, and the Earth's angular radius there."""
 
     time_s: Float[ndarray, " t"]
     rate: float
@@ -80,10 +99,12 @@ class _Orbit:
 
     @property
     def earth_angle(self) -> float:
+        """The Earth's angular radius, in rad."""
         return float(np.arcsin(EARTH_RADIUS_M / self.radius_m))
 
 
 def sequence_spec(recipe: Recipe, seed: int, sequence: int) -> SequenceSpec:
+    """What a sequence shows, by its number alone: spread evenly over the sequences of its spacecraft."""
     craft, turn = sequence % len(recipe.spacecraft), sequence // len(recipe.spacecraft)
     shift = np.random.default_rng([seed, recipe.key, craft]).random(3)
     u = (shift + turn * _EVEN) % 1.0
@@ -105,13 +126,23 @@ def sequence_spec(recipe: Recipe, seed: int, sequence: int) -> SequenceSpec:
 
 @lru_cache(maxsize=8)
 def sample_sequence(recipe: Recipe, spacecraft: Spacecraft, seed: int, sequence: int) -> SequenceMotion:
-    """The first candidate that obeys the recipe. The same arguments give the same sequence."""
+    """The first candidate that obeys the recipe's limits. The same arguments give the same sequence.
+
+    Args:
+        recipe: The ranges.
+        spacecraft: Its keypoints are what must stay in view.
+        seed: Of the dataset.
+        sequence: From 0.
+
+    Raises:
+        GknetError: None of 4,000 candidates obeys.
+    """
     spec = sequence_spec(recipe, seed, sequence)
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, recipe.key, sequence, attempt])
-        solved = _candidate(recipe, spacecraft, spec, rng)
-        if solved is not None:
-            return solved
+        candidate = _candidate(recipe, spacecraft, spec, rng)
+        if candidate is not None:
+            return candidate
     raise GknetError(
         f"recipe {recipe.name}, sequence {sequence}: no motion of {spacecraft.name} obeys its limits after {_ATTEMPTS} "
         "tries; widen span, whole_fraction or phase_deg"
@@ -186,7 +217,7 @@ def _orbit(recipe: Recipe, spin_deg_s: float, rng: np.random.Generator) -> _Orbi
 
 
 def _path(spec: SequenceSpec, motion: Motion, orbit: _Orbit, rng: np.random.Generator) -> Float[ndarray, "t 3"] | None:
-    """The chaser in LVLH, at a scale of its own, with the Earth where it is wished."""
+    """The chaser in LVLH, at a scale of its own, with the Earth where the scene has it."""
     if spec.kind == "fly_around":
         angles = rng.uniform(0, 2 * np.pi, size=2)
         path = trajectory.fly_around(orbit.rate, orbit.time_s, 1.0, rng.uniform(0, 2.5), (angles[0], angles[1]))
@@ -202,7 +233,7 @@ def _path(spec: SequenceSpec, motion: Motion, orbit: _Orbit, rng: np.random.Gene
 
 
 def _direction(scene: Scene, earth_angle: float, rng: np.random.Generator) -> Float[ndarray, "3"]:
-    """From the spacecraft to the chaser in LVLH, such that the camera looks off the nadir as suits the scene."""
+    """From the spacecraft to the chaser in LVLH, such that the camera points off the nadir as suits the scene."""
     edge = np.degrees(earth_angle)
     limits = {
         "sky": (edge + _HALF_DIAGONAL_DEG, 180.0),
@@ -229,7 +260,7 @@ def _scene_holds(scene: Scene, earth_angle: float, path: Float[ndarray, "t 3"]) 
 def _sun(
     spec: SequenceSpec, light: LightLimits, orbit: _Orbit, path: Float[ndarray, "t 3"], rng: np.random.Generator
 ) -> Float[ndarray, "3"] | None:
-    """Unit vector to the sun in the inertial frame: the wished phase angle at mid-sequence, no eclipse."""
+    """Unit vector to the sun in the inertial frame: the phase angle of the spec at mid-sequence, no eclipse."""
     chaser = _turn(orbit.inertial_from_lvlh, path / np.linalg.norm(path, axis=1, keepdims=True))
     middle = chaser[len(chaser) // 2]
     aside = np.cross(middle, trajectory.random_direction(rng))
@@ -248,7 +279,7 @@ def _sun(
 
 
 def _attitude(spin_rad_s: float, time_s: Float[ndarray, " t"], rng: np.random.Generator) -> Float[ndarray, "t 3 3"]:
-    """inertial_from_body of a free tumble; principal axes lie anyhow in the body."""
+    """inertial_from_body of a free tumble; the principal axes have a random direction in the body."""
     start = trajectory.random_rotation(rng).as_quat()[[3, 0, 1, 2]]
     spin = spin_rad_s * trajectory.random_direction(rng)
     wxyz, _ = trajectory.tumble(trajectory.random_inertia(rng), start, spin, time_s)
@@ -257,7 +288,7 @@ def _attitude(spin_rad_s: float, time_s: Float[ndarray, " t"], rng: np.random.Ge
 
 
 def _up(path: Float[ndarray, "t 3"], rng: np.random.Generator) -> Float[ndarray, "3"]:
-    """A random image-up: square to the middle line of sight, so that the camera never looks along it."""
+    """A random image-up: square to the middle line of sight, so that the camera never points along it."""
     up = np.cross(path[len(path) // 2], trajectory.random_direction(rng))
     return up / np.linalg.norm(up)
 

@@ -34,8 +34,10 @@ STARLIGHT = 0.002
 class IncidentLight:
     """Light in the body frame. Radiance 1.0 is a white Lambertian surface that faces the full sun.
 
-    sun            unit vector to the sun, whose irradiance is pi
-    earth_centre   of the Earth, a Lambertian sphere, from the spacecraft in Earth radii; None when it gives no light
+    Attributes:
+        sun: (3,) unit vector to the sun, whose irradiance is pi.
+        earth_centre: (3,) from the spacecraft to the centre of the Earth, a Lambertian sphere, in Earth radii; None
+            when it gives no light.
     """
 
     sun: Float[ndarray, "3"]
@@ -79,7 +81,18 @@ class Shader:
     def radiance(
         self, camera: Camera, body_from_cam: Pose, region: Region, light: IncidentLight, seed: int
     ) -> Float32[ndarray, "h w 4"]:
-        """Premultiplied linear RGB and alpha of a region, averaged over each pixel (a box filter)."""
+        """Premultiplied linear RGB and alpha of a region, averaged over each pixel (a box filter).
+
+        Args:
+            camera: Of the window, with square pixels and no skew.
+            body_from_cam: Its pose in m.
+            region: The part of the window that is computed.
+            light: In the body frame.
+            seed: Of the samples.
+
+        Returns:
+            (h, w, 4) float32.
+        """
         rows = max(1, SAMPLES_AT_ONCE // (region.width * self._spp))
         bands = [self._band(camera, body_from_cam, part, light, seed) for part in region.bands(rows)]
         return np.concatenate(bands)
@@ -214,20 +227,20 @@ def _sky(engine: Engine, light: list[Any], direction: Any) -> Any:
     sun, centre, power = mi.Vector3f(*light[:3]), mi.Vector3f(*light[3:6]), light[6]
     along = dr.dot(direction, centre)
     inside = along * along - power
-    seen = (along > 0) & (inside > 0)
+    is_earth = (along > 0) & (inside > 0)
     normal = direction * (along - dr.sqrt(dr.maximum(inside, 0))) - centre
-    lambert = dr.select(seen, dr.maximum(dr.dot(normal, sun), 0), 0)
+    lambert = dr.select(is_earth, dr.maximum(dr.dot(normal, sun), 0), 0)
     return mi.Color3f(*EARTH_ALBEDO) * lambert + STARLIGHT
 
 
 def sky_radiance(light: IncidentLight, directions: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-    """Radiance that comes from each direction of the body frame: what the kernel sees as Earth and sky."""
+    """Radiance from each direction of the body frame, (n, 3): the Earth and the sky of the kernel, in numpy."""
     radiance = np.full((len(directions), 3), STARLIGHT)
     if light.earth_centre is not None:
         along = directions @ light.earth_centre
         inside = along**2 - light.earth_centre @ light.earth_centre + 1
-        seen = (along > 0) & (inside > 0)
-        distance = along[seen] - np.sqrt(inside[seen])
-        normal = distance[:, None] * directions[seen] - light.earth_centre
-        radiance[seen] += np.maximum(normal @ light.sun, 0)[:, None] * EARTH_ALBEDO
+        is_earth = (along > 0) & (inside > 0)
+        distance = along[is_earth] - np.sqrt(inside[is_earth])
+        normal = distance[:, None] * directions[is_earth] - light.earth_centre
+        radiance[is_earth] += np.maximum(normal @ light.sun, 0)[:, None] * EARTH_ALBEDO
     return radiance

@@ -22,7 +22,12 @@ _RA, _DEC, _MAGNITUDE, _COLOUR = slice(15, 28), slice(29, 42), slice(129, 136), 
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Unit vectors in the equatorial frame, and irradiance over the sun's, RGB."""
+    """Stars of a catalogue.
+
+    Attributes:
+        directions: (n, 3) unit vectors in the equatorial frame.
+        flux: (n, 3) irradiance over the sun's, RGB.
+    """
 
     directions: Float[ndarray, "n 3"]
     flux: Float[ndarray, "n 3"]
@@ -63,7 +68,14 @@ def _tint(colour_index: Float[ndarray, " n"]) -> Float[ndarray, "n 3"]:
 def add_stars(
     picture: Float32[ndarray, "s s 3"], camera: Camera, window: Crop, cam_from_inertial: Float[ndarray, "3 3"]
 ) -> None:
-    """Each star's light is shared by the four pixels about it, none of it lost."""
+    """Add stars to a picture; the four pixels about a star share its light, none of it lost.
+
+    Args:
+        picture: (s, s, 3) linear RGB radiance, changed in place.
+        camera: Of the full image.
+        window: The square of the full image that the picture shows.
+        cam_from_inertial: (3, 3) rotation from equatorial axes.
+    """
     stars = catalogue()
     rays = stars.directions @ np.asarray(cam_from_inertial).T
     ahead = rays[:, 2] > 0.5

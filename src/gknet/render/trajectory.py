@@ -24,12 +24,20 @@ Positions = Float[ndarray, "t 3"]
 
 
 def mean_motion(orbit_radius_m: float) -> float:
-    """n in rad/s."""
+    """n in rad/s of a circular orbit, from its radius in m."""
     return float(np.sqrt(GRAVITY_M3_S2 / orbit_radius_m**3))
 
 
 def relative_transition(rate: float, time_s: Times) -> Float[ndarray, "t 6 6"]:
-    """The state (x, y, z, x', y', z') at each time from that at 0, for the mean motion `rate` (rad/s)."""
+    """The state (x, y, z, x', y', z') at each time from that at 0 (Clohessy and Wiltshire).
+
+    Args:
+        rate: Mean motion n of the orbit, in rad/s.
+        time_s: (t,) in s.
+
+    Returns:
+        (t, 6, 6) matrices.
+    """
     n, t = rate, np.asarray(time_s, dtype=np.float64)
     s, c = np.sin(n * t), np.cos(n * t)
     phi = np.zeros((len(t), 6, 6))
@@ -44,7 +52,20 @@ def relative_transition(rate: float, time_s: Times) -> Float[ndarray, "t 6 6"]:
 
 
 def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Float[ndarray, "3"]) -> Positions:
-    """The free flight from `start_m` at the first time to `end_m` at the last."""
+    """The free flight between two points of LVLH.
+
+    Args:
+        rate: Mean motion n of the orbit, in rad/s.
+        time_s: (t,) in s, ascending.
+        start_m: (3,) at the first time.
+        end_m: (3,) at the last time.
+
+    Returns:
+        (t, 3) positions in m.
+
+    Raises:
+        GknetError: The flight takes half an orbit or more.
+    """
     elapsed = time_s - time_s[0]
     if not 0 < rate * elapsed[-1] < np.pi:
         raise GknetError(
@@ -58,25 +79,48 @@ def approach(rate: float, time_s: Times, start_m: Float[ndarray, "3"], end_m: Fl
 def fly_around(
     rate: float, time_s: Times, radial_m: float, normal_m: float, angles_rad: tuple[float, float]
 ) -> Positions:
-    """The closed relative ellipse: `radial_m` by twice that along the track, tilted by `normal_m` across it.
+    """The closed relative ellipse. Without y' = -2 n x it would drift.
 
-    `angles_rad` are the phases in the orbital plane and across it at time 0. Without y' = -2 n x the ellipse drifts.
+    Args:
+        rate: Mean motion n of the orbit, in rad/s.
+        time_s: (t,) in s.
+        radial_m: Its radial semi-axis; that along the track is twice as long.
+        normal_m: Its amplitude across the orbital plane.
+        angles_rad: Phases in the orbital plane and across it at time 0.
+
+    Returns:
+        (t, 3) positions in LVLH in m.
     """
     in_plane, across = (rate * time_s + angle for angle in angles_rad)
     return np.stack([radial_m * np.cos(in_plane), -2 * radial_m * np.sin(in_plane), normal_m * np.cos(across)], axis=1)
 
 
 def hold(time_s: Times, point_m: Float[ndarray, "3"], slack: float, rng: np.random.Generator) -> Positions:
-    """Station-keeping: a point of LVLH held by thrust within the fraction `slack` of its distance.
+    """Station-keeping at a point of LVLH.
 
     Only points on the track (x = z = 0) are equilibria; the others cost propellant, and inspectors pay it.
+
+    Args:
+        time_s: (t,) in s.
+        point_m: (3,) in LVLH.
+        slack: Thrust holds the position within this fraction of the point's distance.
+        rng: Draws the motion.
+
+    Returns:
+        (t, 3) positions in LVLH in m.
     """
     wander = np.stack([band_limited(time_s, rng, (60.0, 400.0)) for _ in range(3)], axis=1)
     return point_m + slack * float(np.linalg.norm(point_m)) * wander
 
 
 def band_limited(time_s: Times, rng: np.random.Generator, periods_s: tuple[float, float]) -> Times:
-    """A smooth random process in [-1, 1]: five sines with periods in the band and random phases."""
+    """A smooth random process in [-1, 1]: five sines with random phases.
+
+    Args:
+        time_s: (t,) in s.
+        rng: Draws the sines.
+        periods_s: The shortest and the longest period, in s.
+    """
     periods = np.exp(rng.uniform(np.log(periods_s[0]), np.log(periods_s[1]), size=5))
     weights = rng.dirichlet(np.full(5, 2.0))
     phases = rng.uniform(0, 2 * np.pi, size=5)
@@ -86,10 +130,16 @@ def band_limited(time_s: Times, rng: np.random.Generator, periods_s: tuple[float
 def tumble(
     inertia: Float[ndarray, "3"], attitude_wxyz: Float[ndarray, "4"], spin_rad_s: Float[ndarray, "3"], time_s: Times
 ) -> tuple[Float[ndarray, "t 4"], Positions]:
-    """Torque-free rotation: quaternions wxyz (inertial from body) and body rates at each time, from those at 0.
+    """Torque-free rotation (Euler's equations). Angular momentum and energy stay to about 1e-9.
 
-    `inertia` are the principal moments, along the body's axes here; only their ratios matter.
-    Angular momentum and energy stay to about 1e-9.
+    Args:
+        inertia: (3,) principal moments, along the body's axes here; only their ratios matter.
+        attitude_wxyz: (4,) quaternion, inertial from body, at time 0.
+        spin_rad_s: (3,) body rates at time 0.
+        time_s: (t,) in s, from 0.
+
+    Returns:
+        (t, 4) quaternions wxyz and (t, 3) body rates in rad/s.
     """
     a, b, c = (
         float((inertia[1] - inertia[2]) / inertia[0]),
@@ -141,7 +191,15 @@ def random_direction(rng: np.random.Generator) -> Float[ndarray, "3"]:
 
 
 def look_at(target: Positions, up: Float[ndarray, "3"]) -> Float[ndarray, "t 3 3"]:
-    """Rotations cam_from_frame of cameras that look along `target` (t, 3); image up is the side of `up`."""
+    """Attitudes of cameras by where they point.
+
+    Args:
+        target: (t, 3) directions of the optical axes.
+        up: (3,) image up is on the side of this vector.
+
+    Returns:
+        (t, 3, 3) rotations cam_from_frame, from the frame of the vectors.
+    """
     z = target / np.linalg.norm(target, axis=1, keepdims=True)
     x = np.cross(z, up)
     x /= np.linalg.norm(x, axis=1, keepdims=True)

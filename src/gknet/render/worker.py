@@ -90,7 +90,14 @@ class WorkerState:
 
 
 def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: Crop) -> RenderedFrame:
-    """The picture of `window` as the sensor gives it: black beyond its edge, as where a crop leaves an image."""
+    """The picture of a window as the sensor gives it: black beyond its edge, as where a crop leaves an image.
+
+    Args:
+        renderer: Of the spacecraft.
+        spacecraft: Its keypoints get their visibility.
+        shot: The frame.
+        window: A square of its full image.
+    """
     rendered = renderer.render(shot, window)
     radiance = background(shot, window)
     radiance *= (1 - rendered.alpha)[..., None]
