@@ -15,11 +15,16 @@ class GknetError(Exception):
 
 
 class DivergedError(GknetError):
-    """A training whose loss is no number any more."""
+    """The loss of a training is no longer a number."""
 
 
 class MissingExtraError(GknetError):
-    """An optional part of gknet was asked for that is not installed."""
+    """An optional part of gknet is needed that is not installed.
+
+    Args:
+        extra: Name of the extra, as in `pip install 'gknet[extra]'`.
+        module: What could not be imported.
+    """
 
     def __init__(self, extra: str, module: str) -> None:
         super().__init__(f"this needs the module '{module}': pip install 'gknet[{extra}]'")

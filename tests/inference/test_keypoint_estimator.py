@@ -162,9 +162,19 @@ def test_what_one_orientation_alone_shows_is_averaged_out() -> None:
     assert batches == [1, 2, 4]
 
 
-def test_other_orientations_than_quarter_turns_are_refused() -> None:
-    with pytest.raises(GknetError, match="1, 2 or 4"):
-        InferenceSettings(tta_rotations=3)
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"tta_rotations": 3}, "1, 2 or 4"),
+        ({"input_size": 0}, "input_size"),
+        ({"locator_size": 100_000}, "locator_size"),
+        ({"min_located": math.nan}, "min_located"),
+        ({"refine_iou": 1.5}, "refine_iou"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(GknetError, match=words):
+        InferenceSettings(**wrong)
 
 
 def test_a_box_that_the_keypoints_contradict_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:

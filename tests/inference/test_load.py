@@ -66,6 +66,9 @@ def test_unknown_model_lists_what_exists(tmp_path: Path) -> None:
         load_estimator(tmp_path / "none")
     for name in shipped_models():
         assert name in str(caught.value)
+    for nothing in ("", "\0"):
+        with pytest.raises(GknetError, match="got no name"):
+            load_estimator(nothing)
     with pytest.raises(GknetError, match="'none': expected a shipped model"):
         shipped_folder("none")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import hypothesis
 import numpy as np
 import pytest
@@ -385,6 +388,24 @@ def test_a_box_that_the_image_cuts_refuses_no_pose() -> None:
     assert with_box(few, Box(0.0, 0.0, float(CAMERA.width), 1.0)).inliers.sum() == 7
 
 
-def test_a_ratio_to_the_box_that_refuses_everything_is_an_error() -> None:
-    with pytest.raises(GknetError, match="above 1"):
-        PnpSettings(max_box_ratio=1.0)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"max_box_ratio": 1.0},
+        {"max_box_ratio": math.nan},
+        {"threshold_px": ()},
+        {"threshold_px": (5.0, math.inf)},
+        {"threshold_px": (math.nan,)},
+        {"min_score": -0.1},
+        {"min_score": math.nan},
+        {"min_inliers": 3},
+        {"min_inlier_fraction": 1.1},
+        {"max_rms_px": math.nan},
+        {"box_sigma": 0.0},
+        {"covariance_scale": math.inf},
+    ],
+    ids=str,
+)
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(GknetError, match="pnp: expected"):
+        PnpSettings(**wrong)

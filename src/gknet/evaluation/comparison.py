@@ -53,7 +53,14 @@ class Trial:
 
     @staticmethod
     def of(run: ProtocolRun, method: str, spacecraft: str, seed: int) -> Trial:
-        """The errors of an evaluation under one protocol."""
+        """The errors of an evaluation under one protocol.
+
+        Args:
+            run: The evaluation.
+            method: What is compared.
+            spacecraft: Its name.
+            seed: Of the training.
+        """
         found = [case.errors for case in run.cases]
         rows = [measured(case) for case in run.cases]
         values = {
@@ -192,7 +199,16 @@ def difference(
 
 
 def seed_gaps(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> list[float]:
-    """The difference of the means of each seed by itself, in the metric's unit; NaN where no frame has a value."""
+    """The difference of the means of each seed by itself.
+
+    Args:
+        first: Trials of one method, one for each seed.
+        second: Trials of the other method, of the same seeds.
+        metric: Of `measured`.
+
+    Returns:
+        First minus second in the metric's unit, for each seed; NaN where no frame has a value.
+    """
 
     def mean(trial: Trial) -> float:
         known = trial.values[metric][~np.isnan(trial.values[metric])]
@@ -202,7 +218,15 @@ def seed_gaps(first: Sequence[Trial], second: Sequence[Trial], metric: str) -> l
 
 
 def where_attitudes_hold(first: Sequence[Trial], second: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """Both methods, seed by seed, on the frames in which both attitudes are within 20 degrees; other values are NaN."""
+    """Both methods, seed by seed, on the frames in which both attitudes are within 20 degrees.
+
+    Args:
+        first: Trials of one method, one for each seed.
+        second: Trials of the other method, of the same seeds.
+
+    Returns:
+        The same trials; the values of the other frames are NaN.
+    """
 
     def masked(trial: Trial, known: Bool[ndarray, " m"]) -> Trial:
         return replace(trial, values={name: np.where(known, column, np.nan) for name, column in trial.values.items()})

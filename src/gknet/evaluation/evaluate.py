@@ -14,7 +14,8 @@ from numpy import ndarray
 
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
-from gknet.evaluation.metrics import FrameErrors, Summary, compute_errors, keypoint_errors_px, oracle_crop, summarise
+from gknet.evaluation.metrics import FrameErrors, compute_errors, keypoint_errors_px, oracle_crop
+from gknet.evaluation.summary import Summary, summarise
 from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints, PoseEstimator, Unreadable
 from gknet.inference.crop import Crop
 from gknet.spacecraft import Spacecraft
@@ -153,7 +154,12 @@ class KeypointStatistics:
 
 
 def keypoint_statistics(run: ProtocolRun, k: int) -> KeypointStatistics:
-    """Median and 90th percentile of keypoint `k`'s error, and its median where the spacecraft hides it."""
+    """Median and 90th percentile of a keypoint's error, and its median where the spacecraft hides it.
+
+    Args:
+        run: All frames under one protocol.
+        k: Index of the keypoint.
+    """
     distance = np.array([case.keypoint_px[k] for case in run.cases])
     hidden = np.array([case.visible is not None and not case.visible[k] for case in run.cases])
     in_view = np.isfinite(distance)

@@ -17,6 +17,9 @@ from gknet.inference.locator import locate
 from gknet.inference.network_io import Forward, check_image
 from gknet.spacecraft import Spacecraft
 
+MAX_INPUT_SIZE = 4096
+"""Side of the largest input of a network in pixels."""
+
 PLAUSIBLE_SIZE = (0.25, 6.0)
 """Projected diameter of the spacecraft over the crop's side: small for a view end-on, large when cut off."""
 
@@ -33,6 +36,9 @@ class InferenceSettings:
         refine_iou: Intersection over union of the two crops below which the first one counts as off.
         tta_rotations: Rotations of the crop, 1, 2 or 4, whose heatmaps a keypoint network averages (rotation test-time
             augmentation).
+
+    Raises:
+        GknetError: A number is out of its range.
     """
 
     input_size: int = 256
@@ -45,6 +51,12 @@ class InferenceSettings:
     def __post_init__(self) -> None:
         if self.tta_rotations not in (1, 2, 4):
             raise GknetError(f"tta_rotations: expected 1, 2 or 4 rotations, got {self.tta_rotations}")
+        for name in ("input_size", "locator_size"):
+            if not 1 <= getattr(self, name) <= MAX_INPUT_SIZE:
+                raise GknetError(f"{name}: expected 1 to {MAX_INPUT_SIZE} px, got {getattr(self, name)}")
+        for name in ("min_located", "refine_iou"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise GknetError(f"{name}: expected 0 to 1, got {getattr(self, name)}")
 
 
 class CropEstimator(ABC):
@@ -69,7 +81,13 @@ class CropEstimator(ABC):
 
     @abstractmethod
     def estimate_in(self, image: UInt8[ndarray, "h w 3"], camera: Camera, box: Box) -> Estimate:
-        """The pose of the spacecraft in a box inside the image, or why there is none."""
+        """The pose of the spacecraft in a box inside the image, or why there is none.
+
+        Args:
+            image: The full image, RGB.
+            camera: The camera of the image.
+            box: Where the spacecraft is, clipped to the image.
+        """
 
     def estimate(self, image: UInt8[ndarray, "h w *c"], camera: Camera, box: Box | None = None) -> Estimate:
         """Estimate the pose of the spacecraft in an image.
@@ -116,7 +134,13 @@ class CropEstimator(ABC):
         return locate(check_image(image), self.locator, self.settings.locator_size, self.settings.min_located)
 
     def contradiction(self, cam_from_body: Pose, camera: Camera, crop: Crop) -> Failure | None:
-        """Why a pose cannot belong to the crop in which it was found; None when it can."""
+        """Why a pose cannot belong to the crop in which it was found; None when it can.
+
+        Args:
+            cam_from_body: The pose.
+            camera: The camera of the full image.
+            crop: Where it was found.
+        """
         range_m = np.linalg.norm(cam_from_body.translation_m)
         ratio = float(camera.matrix[0, 0] * self.spacecraft.diameter_m / range_m) / crop.side
         if PLAUSIBLE_SIZE[0] <= ratio <= PLAUSIBLE_SIZE[1]:

@@ -68,7 +68,13 @@ class CropPose:
         return CropPose(offset, math.log(size_m / diameter_m), allocentric_wxyz(pose))
 
     def pose(self, camera: Camera, crop: Crop, diameter_m: float) -> Pose:
-        """The pose cam_from_body that the crop shows: the inverse of `of`."""
+        """The pose cam_from_body that the crop shows: the inverse of `of`.
+
+        Args:
+            camera: The camera of the full image.
+            crop: The crop of the image.
+            diameter_m: Of the spacecraft.
+        """
         pixel = camera.undistort(crop.to_image((self.offset + 0.5) * crop.size)[None])[0]
         depth_m = math.exp(self.log_depth) * diameter_m * focal_px(camera) / crop.side
         ray = np.linalg.solve(camera.matrix, np.append(pixel, 1.0))

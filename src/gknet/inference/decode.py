@@ -88,7 +88,12 @@ def decode_heatmaps(heatmaps: Float[ndarray, "n h w"], stride: float, decoding: 
 
 
 def keypoints_to_image(keypoints: Keypoints, crop: Crop) -> Keypoints:
-    """From pixels of a crop's network input to pixels of the image it was cut from."""
+    """Keypoints in the image from which a crop was cut.
+
+    Args:
+        keypoints: In pixels of the crop's network input.
+        crop: The crop.
+    """
     return Keypoints(crop.to_image(keypoints.pixels), keypoints.score, keypoints.covariance_px2 / crop.scale**2)
 
 

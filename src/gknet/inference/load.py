@@ -95,6 +95,8 @@ def load_estimator(
 
 def _folder_of(name_or_folder: str | Path) -> Path:
     """The folder of a shipped model or of the user's; a name that may mean either is refused."""
+    if not str(name_or_folder) or "\0" in str(name_or_folder):
+        raise GknetError("model: expected the name of a shipped model or a folder, got no name")
     folder = Path(name_or_folder)
     separators = {os.sep, os.altsep or os.sep}
     if isinstance(name_or_folder, Path) or any(sign in name_or_folder for sign in separators):

@@ -53,6 +53,11 @@ def check_image(image: object) -> UInt8[ndarray, "h w 3"]:
 
 
 def network_input(image: UInt8[ndarray, "h w 3"], crop: Crop) -> Float32[ndarray, "1 3 size size"]:
-    """The crop as a batch of one: RGB in [0, 1], channels first."""
+    """The crop as a batch of one: RGB in [0, 1], channels first.
+
+    Args:
+        image: The full image, RGB.
+        crop: The part to cut out and resize.
+    """
     cut = crop.cut(image).transpose(2, 0, 1)[None]
     return np.ascontiguousarray(cut, dtype=np.float32) / np.float32(255)

@@ -44,8 +44,8 @@ def open_session(model: Path | bytes, threads: int | None = None, device: str = 
         raise GknetError(f"device: expected one of {', '.join(PROVIDERS)}, got '{device}'")
     if PROVIDERS[device] not in available_providers():
         raise GknetError(f"device {device}: this onnxruntime cannot use it; install onnxruntime-gpu")
-    if threads is not None and not 1 <= threads <= MAX_THREADS:
-        raise GknetError(f"threads: expected 1 to {MAX_THREADS}, got {threads}")
+    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= MAX_THREADS):
+        raise GknetError(f"threads: expected a whole number, 1 to {MAX_THREADS}, got {threads}")
     if isinstance(model, Path) and not model.is_file():
         raise GknetError(f"{model}: no such model file")
     options = onnxruntime.SessionOptions()

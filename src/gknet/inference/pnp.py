@@ -50,6 +50,15 @@ class PnpSettings:
     def __post_init__(self) -> None:
         if not self.threshold_px or not all(0 < threshold < np.inf for threshold in self.threshold_px):
             raise GknetError(f"pnp: expected positive thresholds, got {self.threshold_px}")
+        if not 0 <= self.min_score <= 1:
+            raise GknetError(f"pnp: expected a least score of 0 to 1, got {self.min_score}")
+        if not (self.min_inliers >= 4 and 0 <= self.min_inlier_fraction <= 1):
+            raise GknetError(
+                "pnp: expected 4 inliers or more and a fraction of 0 to 1, "
+                f"got {self.min_inliers} and {self.min_inlier_fraction}"
+            )
+        if not self.max_rms_px > 0:
+            raise GknetError(f"pnp: expected a positive limit of the rms, got {self.max_rms_px}")
         if not 0 < self.box_sigma < np.inf:
             raise GknetError(f"pnp: expected a positive sigma of the box, got {self.box_sigma}")
         if not self.max_box_ratio > 1:

@@ -71,7 +71,15 @@ class PnpProblem:
 
 
 def residuals_px(problem: PnpProblem, pose: Pose) -> Float[ndarray, " k"]:
-    """Distance from each keypoint to its projection; infinite behind the camera."""
+    """Distance from each keypoint to its projection.
+
+    Args:
+        problem: The measurements.
+        pose: cam_from_body.
+
+    Returns:
+        (k,) in image pixels; infinite behind the camera.
+    """
     distance = np.linalg.norm(problem.camera.project(pose.transform(problem.usable_m)) - problem.pixels, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 
@@ -168,7 +176,16 @@ def refine(problem: PnpProblem, pose: Pose, use: Bool[ndarray, " k"]) -> Pose:
 
 
 def covariance_of(problem: PnpProblem, pose: Pose, inliers: Bool[ndarray, " k"]) -> Float[ndarray, "6 6"] | None:
-    """(J^T W J)^-1 of the inliers and the edges, as in `Estimate`; None when the inliers alone have no inverse."""
+    """(J^T W J)^-1 of the inliers and the box's edges.
+
+    Args:
+        problem: The measurements.
+        pose: The refined cam_from_body.
+        inliers: (k,) bool: which usable keypoints count.
+
+    Returns:
+        (6, 6) as in `Estimate`; None when the inliers alone do not determine the pose.
+    """
     alone = replace(problem, edges=None)
     for each in (alone,) if problem.edges is None else (alone, problem):
         _, normal, _ = _system(each, pose, inliers, _capped)

@@ -108,5 +108,10 @@ def spacecraft_toml(spacecraft: Spacecraft) -> str:
 
 
 def save_spacecraft(spacecraft: Spacecraft, path: str | Path) -> None:
-    """Write a spacecraft's .toml; its mesh is named, not copied."""
+    """Write a spacecraft's .toml; its mesh is named, not copied.
+
+    Args:
+        spacecraft: What is written.
+        path: The file; one of that name is replaced.
+    """
     write_text(path, spacecraft_toml(spacecraft))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gknet import __version__
 from gknet.evaluation.evaluate import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, ProtocolRun
-from gknet.evaluation.metrics import Statistic
+from gknet.evaluation.summary import Statistic
 from gknet.report.chart import page_style
 from gknet.report.gallery import Gallery
 from gknet.report.markup import escaped

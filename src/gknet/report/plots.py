@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gknet.evaluation.evaluate import PROTOCOL_WORDS, Evaluation, ProtocolRun, keypoint_statistics
-from gknet.evaluation.metrics import Bin
+from gknet.evaluation.summary import Bin
 from gknet.report.chart import Axis, Series, bar_chart, curve_chart
 
 _LEAST = {"rmse_px": 0.1, "e_t": 1e-4, "e_q_rad": 1e-3}

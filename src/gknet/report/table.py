@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gknet.evaluation.evaluate import Evaluation, ProtocolRun
-from gknet.evaluation.metrics import Statistic
+from gknet.evaluation.summary import Statistic
 from gknet.io.text import printable
 
 
