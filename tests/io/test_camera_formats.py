@@ -103,6 +103,17 @@ COLMAP = """# Camera list with one line of data per camera:
 """
 
 
+OURS_JSON = {"matrix": K.tolist(), "width": 640, "height": 480, "distortion": BENT}
+XML = """<?xml version="1.0"?>
+<opencv_storage>
+<image_width>640</image_width>
+<image_height>480</image_height>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>5. 0. 3. 0. 5. 2. 0. 0. 1.</data></camera_matrix>
+</opencv_storage>
+"""
+
+
 def written(folder: Path, text: str, name: str = "file.any") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
@@ -237,6 +248,7 @@ def test_byte_order_marks_and_windows_lines(tmp_path: Path, text: str, end: str)
         ('{"matrix": [[1e400]], "width": 5, "height": 5}', "camera matrix"),
         ("<html></html>", "expected <opencv_storage>"),
         ("<opencv_storage>", "not valid XML"),
+        (XML.replace("640", "9" * 5000), "width: expected a whole number"),
         ("<opencv_storage><a>1</a></opencv_storage>", "expected camera_matrix.*got a"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "DOCTYPE"),
         ("a: &x [1]\nb: *x\n", "alias"),
@@ -244,7 +256,8 @@ def test_byte_order_marks_and_windows_lines(tmp_path: Path, text: str, end: str)
         ("a: !!python/object:os.system []\n", "not valid YAML"),
         ("- 1\n- 2\n", "expected a camera file|three numbers"),
         ("camera_matrix: 5\n", "expected 9 numbers, got 1"),
-        ("a: " + "[" * 5000, "too deeply|not valid"),
+        ("a: " + "[" * 5000, "more than 500 lists"),
+        ("a: " + "[" * 499, "not valid|too deeply"),
         ("K: [1, 2]\nD: []\nwidth: 5\nheight: 5\n", "camera_matrix: expected 9 numbers, got 2"),
         ("K: [1, 2]\nD: []\n", "missing width, height"),
         (ROS_CALIBRATION.replace("plumb_bob", "magic"), "distortion_model: expected plumb_bob.*got 'magic'"),
@@ -282,17 +295,6 @@ def test_a_mutated_file_is_a_camera_or_one_line(tmp_path_factory: pytest.TempPat
         assert isinstance(read_camera(path), Camera | MatrixOnly)
     except GknetError as error:
         assert str(path) in str(error)  # noqa: PT017  (both ends are right)
-
-
-OURS_JSON = {"matrix": K.tolist(), "width": 640, "height": 480, "distortion": BENT}
-XML = """<?xml version="1.0"?>
-<opencv_storage>
-<image_width>640</image_width>
-<image_height>480</image_height>
-<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
-  <data>5. 0. 3. 0. 5. 2. 0. 0. 1.</data></camera_matrix>
-</opencv_storage>
-"""
 
 
 def test_a_matrix_of_another_resolution_is_refused_with_both_sizes(tmp_path: Path) -> None:

@@ -241,9 +241,20 @@ def test_too_many_pixels_are_refused_by_the_header(
 
 
 def test_a_bomb_takes_no_memory(tmp_path: Path) -> None:
-    (tmp_path / "bomb.png").write_bytes(chunked(8, b"\0", 30000, 30000))
+    bomb = tmp_path / "bomb.png"
+    bomb.write_bytes(chunked(8, b"\0", 30000, 30000) + bytes(10**6))
     with pytest.raises(GknetError, match="30000 x 30000"):
-        read_image(tmp_path / "bomb.png")
+        read_image(bomb)
+    bomb.write_bytes(chunked(16, b"\0", 10000, 10000))
+    with pytest.raises(GknetError, match="damaged"):
+        read_image(bomb)
+
+
+def test_the_best_compression_of_a_png_is_read(tmp_path: Path) -> None:
+    rows = zlib.compress(bytes(4001 * 4000), 9)
+    assert 4000 * 4000 / len(rows) > 1000
+    (tmp_path / "a.png").write_bytes(chunked(8, bytes(4001 * 4000), 4000, 4000))
+    assert read_image(tmp_path / "a.png").shape == (4000, 4000, 3)
 
 
 @pytest.mark.parametrize("name", ["a:b.png", "c%03d.png", "é ü.png", os.fsdecode(b"caf\xe9.png"), "[1].png"])

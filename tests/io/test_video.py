@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import time
 from collections.abc import Iterable
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -280,7 +281,9 @@ def test_a_live_source_is_bounded(source: int | str, monkeypatch: pytest.MonkeyP
         return FakeCapture(20)
 
     monkeypatch.setattr(cv2, "VideoCapture", opened)
-    monkeypatch.setattr("gknet.io.video.STREAM_TIMEOUT_S", 0.2)
+    if source == 0:
+        monkeypatch.setattr("gknet.io.video.STREAM_TIMEOUT_S", 0.2)
+    start = time.monotonic()
     video = open_live(source, limit=7)
     assert video.fps == 25
     frames = list(video.frames(2))
@@ -289,6 +292,7 @@ def test_a_live_source_is_bounded(source: int | str, monkeypatch: pytest.MonkeyP
     assert times == sorted(times)
     assert len(list(LiveVideo(source, 25, 1000).frames())) == 20
     assert given == [source] * 3
+    assert time.monotonic() - start < 8  # less than the timeout
 
 
 def test_a_stream_over_http(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,8 @@ def _size(source: object, values: Mapping[str, object]) -> tuple[object, object]
 
 def _pixels(source: object, name: str, value: object) -> int:
     """XML knows no numbers, only text."""
-    return whole(source, name, int(value) if isinstance(value, str) and value.strip().isdecimal() else value)
+    is_number = isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value.strip())
+    return whole(source, name, int(str(value)) if is_number else value)
 
 
 def from_xml(source: object, text: str) -> Camera | MatrixOnly:

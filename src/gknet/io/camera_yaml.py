@@ -17,6 +17,8 @@ from gknet.io.camera_opencv import from_storage, is_storage
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import quoted
 
+MOST_BRACKETS = 500
+
 _ROS_MODELS: dict[str, tuple[LensModel, tuple[int, ...]]] = {
     "plumb_bob": ("pinhole", (4, 5)),
     "rational_polynomial": ("pinhole", (8, 12, 14)),
@@ -55,6 +57,8 @@ def from_yaml(source: object, text: str) -> Camera | MatrixOnly:
 
 
 def _content(source: object, text: str) -> object:
+    if text.count("[") + text.count("{") > MOST_BRACKETS:  # parsing takes the square of the nesting
+        raise GknetError(f"{source}: expected a camera file, got YAML of more than {MOST_BRACKETS} lists")
     body = re.sub(r"\A%YAML[^\n]*\n", "", text)  # OpenCV 3 and 4 write "%YAML:1.0", which is no YAML
     try:
         return next(iter(yaml.load_all(body, _Loader)), None)

@@ -25,8 +25,8 @@ from gknet.io.atomic import write_bytes
 from gknet.io.image_header import ImageHeader, read_header
 from gknet.io.opencv import checked_file, quiet
 
-MOST_PIXELS = 2**28
-"""268 megapixels, 0.8 GB as RGB."""
+MOST_PIXELS = 200_000_000
+"""200 megapixels, 0.6 GB as RGB; the largest sensors have 150."""
 
 MOST_BYTES = 2**31 - 1
 BIT_DEPTHS = range(8, 33)
@@ -97,7 +97,7 @@ def _decoded(path: Path) -> tuple[ndarray, ImageHeader]:
     data = _file_bytes(path)
     header = read_header(data)
     if header is None:
-        raise GknetError(f"{path}: expected an image (JPEG, PNG, TIFF ...), got something else")
+        raise GknetError(f"{path}: expected an image (JPEG, PNG, TIFF ...), got something else or a damaged one")
     if header.width * header.height > MOST_PIXELS:
         raise GknetError(
             f"{path}: expected {MOST_PIXELS} pixels at most, got {header.width} x {header.height}; reduce it first"

@@ -10,6 +10,10 @@ import struct
 from dataclasses import dataclass
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+DEFLATE_RATIO = 1040
+"""Deflate makes data 1032 times smaller at most: a PNG that is smaller than its size allows has a damaged header."""
+
 _PNM = re.compile(rb"P([1-6])" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,10}))" * 2 + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5}))?")
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
@@ -61,7 +65,9 @@ def _jpeg(data: bytes) -> ImageHeader | None:
 
 
 def _png(data: bytes) -> ImageHeader | None:
-    width, height = struct.unpack_from(">II", data, 16)
+    width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
+    if width * height * depth * _PNG_CHANNELS.get(colour, 1) > 8 * DEFLATE_RATIO * len(data):
+        return None
     at, used_bits, has_pages = 8, None, False
     while data[at + 4 : at + 8] not in (b"IDAT", b""):
         length, name = struct.unpack_from(">I4s", data, at)

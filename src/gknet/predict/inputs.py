@@ -8,7 +8,6 @@ What an earlier run of gknet wrote into a folder (overlays/ and overlay.mp4 besi
 
 from __future__ import annotations
 
-import glob
 import os
 import re
 from collections import Counter
@@ -103,14 +102,23 @@ def _of_input(text: str) -> Iterator[Found]:
     elif re.fullmatch(r"[0-9]{1,2}", text):
         yield Found(Kind.LIVE, text, f"camera{text}")
     elif _is_pattern(text):
-        matches = sorted(glob.iglob(text, recursive=True), key=natural_key)
-        if not matches:
-            raise GknetError(f"{quoted(text)[1:-1]}: no file matches this pattern")
-        for match in matches:
+        for match in _matches(text):
             if os.path.isdir(match) or _kind(match) is not None:
                 yield from _of_path(match)
     else:
         raise GknetError(f"{printable(text)}: no such image, video or folder")
+
+
+def _matches(pattern: str) -> list[str]:
+    """What matches a pattern, hidden files left out; "**" is any number of folders, and no links."""
+    start = Path(pattern).anchor
+    try:
+        matches = [str(path) for path in Path(start).glob(pattern[len(start) :]) if not path.name.startswith(".")]
+    except (ValueError, NotImplementedError, OSError) as error:
+        raise GknetError(f"{printable(pattern)}: not a pattern that can be followed ({error})") from error
+    if not matches:
+        raise GknetError(f"{printable(pattern)}: no file matches this pattern")
+    return sorted(matches, key=natural_key)
 
 
 def _is_pattern(text: str) -> bool:
@@ -155,14 +163,16 @@ def _of_folder(root: str) -> list[Found]:
             folders.clear()
             continue
         visited.add((state.st_dev, state.st_ino))
+        below = os.path.relpath(folder, root).replace(os.sep, "/")
+        prefix = "" if below == "." else f"{below}/"
         own = OWN_NAMES if POSES_NAMES & set(files) else frozenset()
         folders[:] = sorted((name for name in folders if name not in own and name[0] != "."), key=natural_key)
         for file in files:
             path = os.path.join(folder, file)
             taken = file not in own and file[0] != "." and _kind(file) is not None
             if taken and (os.path.isfile(path) or os.path.islink(path)):  # a broken link is a picture that is missing
-                found.append(_file(path, os.path.relpath(path, root).replace(os.sep, "/")))
-    return sorted(found, key=lambda item: natural_key(os.path.relpath(item.path, root)))
+                found.append(_file(path, f"{prefix}{file}"))
+    return sorted(found, key=lambda item: natural_key(item.path))
 
 
 def _listed(path: Path) -> Iterator[Found]:
