@@ -9,6 +9,7 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from gknet.cli.model_options import open_estimator
 from gknet.dataset.skd import SkdDataset
 from gknet.frame import Box, Estimate, Frame
 from gknet.geometry import Camera
+from gknet.inference.keypoint_estimator import KeypointEstimator
 from gknet.inference.load import shipped_folder
 from gknet.io.image import read_image, write_image
 from gknet.io.interrupt import Interrupted
@@ -55,7 +57,7 @@ def predict(*arguments: object) -> int:
     return run(["predict", *(str(argument) for argument in arguments)])
 
 
-def records(out: Path) -> list[dict[str, object]]:
+def records(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "poses.jsonl").read_text().splitlines()]
 
 
@@ -288,7 +290,9 @@ def test_video_without_frames(use: Use, refused: Refused, tmp_path: Path) -> Non
 
 
 def test_turns_reach_the_estimator(refused: Refused, pictures: Path, tmp_path: Path) -> None:
-    assert open_estimator(shipped_folder("satellite_01"), 1, "cpu", 4).settings.tta_rotations == 4
+    estimator = open_estimator(shipped_folder("satellite_01"), 1, "cpu", 4)
+    assert isinstance(estimator, KeypointEstimator)
+    assert estimator.settings.tta_rotations == 4
     shipped = ("--spacecraft", "satellite_01", *LENS)
     line = refused("predict", pictures / "a.jpg", *shipped, "--tta-rotations", "3", "--out", tmp_path / "out")
     assert "1, 2 or 4" in line
@@ -329,13 +333,13 @@ def test_bad_datasets(name: str, text: str, words: str, use: Use, refused: Refus
 def stop_at(monkeypatch: pytest.MonkeyPatch, error: BaseException, picture: int) -> None:
     """Raise inside the estimator at a picture."""
     honest = ToyEstimator.estimate
-    seen = []
+    pictures = []
 
-    def estimate(self: ToyEstimator, *arguments: object) -> object:
-        seen.append(1)
-        if len(seen) > picture:
+    def estimate(self: ToyEstimator, image: ndarray, camera: Camera, box: Box | None = None) -> Estimate:
+        pictures.append(image)
+        if len(pictures) > picture:
             raise error
-        return honest(self, *arguments)
+        return honest(self, image, camera, box)
 
     monkeypatch.setattr(ToyEstimator, "estimate", estimate)
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from gknet.cli.terminal import print_line
+
 
 def fleet(
     out: Annotated[Path, typer.Argument(help="folder for the meshes", file_okay=False)],
@@ -16,15 +18,12 @@ def fleet(
 
     The same files come out every time; the package ships copies of the .toml files. Needs gknet[render].
     """
-    from rich.console import Console
-
     from gknet.fleet import NAMES, build
 
-    console = Console()
     for each in name or NAMES:
         spacecraft = build(each, out)
         path = spacecraft.mesh_path
         if path is not None:
             size = path.stat().st_size / 2**20
             points = f"{spacecraft.keypoint_count} keypoints, {len(spacecraft.edges)} edges"
-            console.print(f"{path}  {size:.1f} MiB, {spacecraft.diameter_m:.2f} m across, {points}", soft_wrap=True)
+            print_line(f"{path}  {size:.1f} MiB, {spacecraft.diameter_m:.2f} m across, {points}")

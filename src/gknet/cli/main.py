@@ -18,11 +18,10 @@ from gknet.cli.evaluate import evaluate
 from gknet.cli.fleet import fleet
 from gknet.cli.predict import predict
 from gknet.cli.render import render
-from gknet.cli.terminal import lasting_output
+from gknet.cli.terminal import lasting_output, print_error, print_line
 from gknet.cli.train import export, train
 from gknet.errors import GknetError, MissingExtraError
 from gknet.io.interrupt import Interrupted, as_keyboard_interrupt
-from gknet.io.text import printable
 
 _USAGE_ERROR = cast(type[typer.BadParameter], typer.BadParameter.__mro__[1])
 """What typer raises for a wrong command line: the parent of its BadParameter, which it does not export."""
@@ -54,7 +53,7 @@ app.command("fleet")(fleet)
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"gknet {__version__}")
+        print_line(f"gknet {__version__}")
         raise typer.Exit()
 
 
@@ -144,8 +143,7 @@ def _os_message(error: OSError) -> str:
 
 def _end(message: str, code: int) -> int:
     """One line on standard error, whatever the message holds."""
-    if sys.stderr is not None:
-        print(f"gknet: {printable(' '.join(message.split()))}", file=sys.stderr)
+    print_error(" ".join(message.split()))
     return code
 
 

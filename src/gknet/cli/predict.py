@@ -40,7 +40,7 @@ def predict(
     inputs: Annotated[
         list[str],
         typer.Argument(
-            metavar="INPUT...",
+            metavar="INPUT",
             help="Images, videos, folders of them, patterns, lists (@list.txt), a camera's number, a stream's URL; "
             "or an SKD dataset.",
         ),

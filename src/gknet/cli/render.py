@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gknet.cli.dataclass_options import with_options
+from gknet.cli.terminal import print_line
 from gknet.render.options import Options, Selection, parse_names, parse_shard
 
 
@@ -27,7 +28,7 @@ def render(
 
     with RenderProgress() as progress:
         result = generate(recipe, out, options, selection, workers, on_progress=progress.show)
-    typer.echo(
+    print_line(
         f"{result.out}: {result.rendered} frames rendered in {result.seconds:.0f} s, "
         f"{result.kept} were there, {len(result.failures)} failed"
     )

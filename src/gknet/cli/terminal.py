@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-import typer
-
 from gknet.io.text import printable
 
 if TYPE_CHECKING:
@@ -23,13 +21,19 @@ if TYPE_CHECKING:
 
 
 def print_line(text: object) -> None:
-    """One line on standard output."""
-    typer.echo(printable(text))
+    """One line on standard output. `typer.echo` would write past `lasting_output` where the encoding is ASCII."""
+    print(printable(text))
 
 
 def print_warning(text: object) -> None:
     """One line on standard error."""
-    typer.echo(f"gknet: warning: {printable(text)}", err=True)
+    print_error(f"warning: {text}")
+
+
+def print_error(text: str) -> None:
+    """A line of gknet's on standard error; nothing where that is closed."""
+    if sys.stderr is not None:
+        print(f"gknet: {printable(text)}", file=sys.stderr)
 
 
 def print_table(table: Table) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from gknet.cli.dataclass_options import with_options
 from gknet.cli.log_lines import log_lines
+from gknet.cli.terminal import print_line
 from gknet.training.schedule import parse_stages
 from gknet.training.settings import TrainSettings
 
@@ -39,7 +40,7 @@ def train(
     with log_lines():
         state = run(data, spacecraft, out, settings, resume, cache, val)
     best = ", ".join(f"{name} {value:.4g}" for name, value in (state.best or {}).items())
-    typer.echo(f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min; best: {best or 'none'}")
+    print_line(f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min; best: {best or 'none'}")
 
 
 def export(
@@ -54,7 +55,7 @@ def export(
 
     with log_lines():
         result = export_run(run, out, TOLERANCE if tolerance is None else tolerance)
-    typer.echo(
+    print_line(
         f"{result.onnx_path}: {result.onnx_path.stat().st_size / 1e6:.1f} MB, "
         f"differs from torch by {result.runtime_difference:.1e}; 16-bit weights change {result.rounding_difference:.1e}"
     )

@@ -6,12 +6,14 @@ import hashlib
 import os
 import re
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 
 from jaxtyping import UInt8
 from numpy import ndarray
 
 from gknet.io.image import write_image
+from gknet.io.opencv import quiet
 from gknet.io.text import printable
 from gknet.io.video import VideoWriter
 
@@ -38,7 +40,7 @@ class Losses:
 
     def note(self, name: str, error: Exception) -> None:
         """Count one."""
-        self.first = self.first or f"{name}: {error or type(error).__name__}"
+        self.first = self.first or f"{name}: {str(error) or type(error).__name__}"
         self.count += 1
 
     @property
@@ -62,14 +64,10 @@ class OverlayNames:
         Where another picture has that name, the suffix is kept before .jpg, and then a number follows.
         """
         whole = _FORBIDDEN.sub("_", printable(picture))
-        tries = [os.path.splitext(whole)[0], whole]
-        number = 2
-        while True:
-            stem = _short(tries.pop(0) if tries else f"{whole}-{number}")
-            if stem.casefold() not in self._used:
-                self._used.add(stem.casefold())
-                return f"{stem}.jpg"
-            number += not tries
+        wanted = chain([os.path.splitext(whole)[0], whole], (f"{whole}-{number}" for number in count(2)))
+        stem = next(stem for name in wanted if (stem := _short(name)).casefold() not in self._used)
+        self._used.add(stem.casefold())
+        return f"{stem}.jpg"
 
 
 def _short(name: str) -> str:
@@ -92,7 +90,8 @@ class OverlayFolder:
         """Write the overlay of a picture, or count it as lost."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_image(self.folder / self.names.name_for(name), picture)
+            with quiet():
+                write_image(self.folder / self.names.name_for(name), picture)
         except Exception as error:  # whatever goes wrong with an overlay costs no pose
             self.losses.note(name, error)
 
@@ -111,7 +110,8 @@ class OverlayFilm:
         try:
             if self._writer is None:
                 self._writer = VideoWriter(self.path, self.fps).__enter__()
-            self._writer.write(picture)
+            with quiet():
+                self._writer.write(picture)
         except Exception as error:  # whatever goes wrong with the film costs no pose
             self.losses.note(name, error)
 
@@ -121,7 +121,8 @@ class OverlayFilm:
         if writer is None or writer.count == 0:
             return
         try:
-            writer.__exit__(None, None, None)
+            with quiet():
+                writer.__exit__(None, None, None)
         except Exception as error:
             self.losses.note(self.path.name, error)
             self.losses.count += writer.count - 1

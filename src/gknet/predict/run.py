@@ -50,7 +50,7 @@ def predict_all(
             try:
                 estimate = _estimate(picture, estimator, box, oracle)
             except (GknetError, cv2.error, MemoryError) as error:
-                writer.add_unreadable(Unreadable.because(picture.name, error or type(error).__name__))
+                writer.add_unreadable(Unreadable.because(picture.name, str(error) or type(error).__name__))
             else:
                 writer.add(picture, estimate)
         interruption.raise_if_requested(_kept_words(writer))
