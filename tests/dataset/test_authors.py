@@ -49,7 +49,7 @@ def picture(random: np.random.Generator) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six sequences of four frames, two spacecraft in each split, with everything that a row of ours can say."""
+    """Six sequences of four frames, two spacecraft in each split, with everything that a row of ours can hold."""
     root, random = tmp_path_factory.mktemp("ours"), np.random.default_rng(6)
     for sequence in range(6):
         name, folder = CRAFTS[sequence % 2], root / sequence_name(sequence)
@@ -57,8 +57,9 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_sequence_files(folder, CAMERA, craft)
         rows = []
         for index in range(4):
-            seen, sun = random.random(11) > 0.4, np.array([0.6, 0.0, -0.8])
-            label = Annotation(name.capitalize(), index, pose(random), 2.0 * index, seen, sun, True, CAMERA, "skd", 3)
+            visible, sun = random.random(11) > 0.4, np.array([0.6, 0.0, -0.8])
+            category, cam_from_body = name.capitalize(), pose(random)
+            label = Annotation(category, index, cam_from_body, 2.0 * index, visible, sun, True, CAMERA, "skd", 3)
             write_frame_files(folder, index, picture(random), 95, None, None)
             rows.append(row_of(label))
         write_annotations(folder, rows)
@@ -68,7 +69,7 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def assert_same(record: authors.Record, frame: Frame, image_path: Path, points_m: np.ndarray) -> None:
-    """What the other reader says of a frame, and what we say."""
+    """The other reader and ours agree on a frame."""
     assert frame.cam_from_body is not None
     assert record.image_path == image_path
     np.testing.assert_allclose(record.matrix, frame.camera.matrix, atol=1e-6)
@@ -79,7 +80,8 @@ def assert_same(record: authors.Record, frame: Frame, image_path: Path, points_m
     box = frame.true_box(points_m)
     assert (box is None) == (record.box is None)
     if box is not None:
-        np.testing.assert_allclose(record.box, (box.x0, box.y0, box.x1, box.y1), atol=1e-4)
+        assert record.box is not None
+        np.testing.assert_allclose(record.box, np.array([box.x0, box.y0, box.x1, box.y1]), atol=1e-4)
 
 
 def test_the_other_reader_agrees_with_ours_on_a_folder_of_ours(ours: Path) -> None:
@@ -94,7 +96,10 @@ def test_the_other_reader_agrees_with_ours_on_a_folder_of_ours(ours: Path) -> No
             theirs = [r for r in records if (r.split, r.category) == (split, name.capitalize())]
             for i, (record, frame) in enumerate(zip(theirs, dataset, strict=True)):
                 assert_same(record, frame, dataset.extras(i).image_path, dataset.spacecraft.points_m)
-                np.testing.assert_array_equal(cv2.imread(str(record.image_path))[:, :, ::-1], frame.image)
+                image = cv2.imread(str(record.image_path))
+                assert image is not None
+                assert frame.image is not None
+                np.testing.assert_array_equal(image[:, :, ::-1], frame.image)
                 compared += 1
     assert compared == 24
 

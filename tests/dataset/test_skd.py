@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,6 +112,11 @@ def test_poses_points_cameras_and_extras_come_back(written: Written) -> None:
     for i, frame in enumerate(dataset):
         extras = dataset.extras(i)
         expected = truth[int(dataset.sequence_of(i).split("/")[1]) - 1, extras.index]
+        assert frame.cam_from_body is not None
+        assert expected.camera is not None
+        assert frame.image is not None
+        assert frame.sun_direction is not None
+        assert expected.sun_direction is not None
         np.testing.assert_allclose(frame.cam_from_body.rotation, expected.cam_from_body.rotation, atol=1e-8)
         np.testing.assert_allclose(frame.cam_from_body.translation_m, expected.cam_from_body.translation_m, rtol=1e-8)
         np.testing.assert_allclose(frame.camera.matrix, expected.camera.matrix, rtol=1e-8)
@@ -153,6 +159,7 @@ def test_original_layout_reads_without_our_extras(written: Written) -> None:
     frame = dataset.frame(1, image=False)
     assert frame.visible is None
     assert frame.image is None
+    assert frame.cam_from_body is not None
     np.testing.assert_allclose(frame.camera.matrix, Camera.from_focal(140.0, 128, 128).matrix)
     assert (frame.camera.width, frame.camera.height) == (SIZE, SIZE)
     np.testing.assert_allclose(
@@ -276,7 +283,7 @@ def lose_annotations(root: Path) -> None:
         (lose_annotations, "annotations.csv"),
     ],
 )
-def test_damaged_files_are_named(written: Written, damage, named: str) -> None:
+def test_damaged_files_are_named(written: Written, damage: Callable[[Path], None], named: str) -> None:
     root, _ = written
     damage(root)
     with pytest.raises(GknetError, match=named) as caught:

@@ -6,6 +6,7 @@ import io
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
@@ -77,7 +78,7 @@ class Glb:
         return self
 
     def write(self, path: Path) -> Path:
-        document = {key: value for key, value in self.json.items() if value}
+        document: dict[str, Any] = {key: value for key, value in self.json.items() if value}
         document |= {
             "asset": {"version": "2.0"},
             "buffers": [{"byteLength": len(self.binary)}],

@@ -49,7 +49,7 @@ def shot(
 LIMB_RAD = float(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + ALTITUDE_M)))
 
 
-def test_limb_is_where_its_tangent_ray_projects():
+def test_limb_is_where_its_tangent_ray_projects() -> None:
     picture = background(shot(earth_ahead(LIMB_RAD)), FULL)
     column = picture[:, 512].sum(axis=1)
     limb_row = int(np.argmax(np.abs(np.diff((column > 0.1).astype(float)))))
@@ -59,27 +59,27 @@ def test_limb_is_where_its_tangent_ray_projects():
     assert column[600:].min() > 0.05
 
 
-def test_atmosphere_is_blue_and_fades_with_height():
+def test_atmosphere_is_blue_and_fades_with_height() -> None:
     picture = background(shot(earth_ahead(LIMB_RAD)), FULL)
     strip = picture[480:512, 500:524].mean(axis=1)
     assert (strip[15:-3, 2] > 1.2 * strip[15:-3, 0]).all()
     assert (np.diff(strip[:, 2]) > -1e-4).all()
 
 
-def test_sunlit_earth_is_dimmer_than_white_and_brighter_than_a_tenth():
+def test_sunlit_earth_is_dimmer_than_white_and_brighter_than_a_tenth() -> None:
     picture = background(shot(earth_ahead(0.2)), FULL)
     assert 0.05 < picture.mean() < 0.8
     assert picture.max() < 1.5
 
 
-def test_night_side_is_dark():
+def test_night_side_is_dark() -> None:
     assert background(shot(earth_ahead(0.2), sun=(0.0, 0.0, 1.0)), Crop(0, 0, 1024, 256))[:, :, 0].mean() < 30
     picture = background(shot(earth_ahead(LIMB_RAD), sun=(0.0, 0.96, 0.28)), Crop(0, 0, 1024, 256))
     assert picture.max() < 0.02
 
 
 @pytest.mark.parametrize("window", [Crop(0, 0, 1024, 256), Crop(300, 400, 320, 320), Crop(-100, 600, 640, 320)])
-def test_windows_show_the_same_earth(window: Crop):
+def test_windows_show_the_same_earth(window: Crop) -> None:
     view = shot(earth_ahead(LIMB_RAD - 0.15))
     whole = background(view, Crop(-512, -512, 2048, 1024))
     part = background(view, window)
@@ -96,26 +96,26 @@ def test_windows_show_the_same_earth(window: Crop):
     assert difference.max() < 0.06
 
 
-def test_weather_belongs_to_the_sequence():
+def test_weather_belongs_to_the_sequence() -> None:
     same, again, other = (background(shot(earth_ahead(0.3), sequence=s), Crop(0, 0, 1024, 128)) for s in (1, 1, 2))
     np.testing.assert_array_equal(same, again)
     assert np.abs(same - other).max() > 0.05
 
 
-def test_without_earth_there_is_next_to_nothing():
+def test_without_earth_there_is_next_to_nothing() -> None:
     picture = background(shot(), FULL)
     assert picture.dtype == np.float32
     assert 0 < picture.max() < 1e-2
 
 
-def test_sun_disc_in_view():
+def test_sun_disc_in_view() -> None:
     picture = background(shot(sun=(0.0, 0.0, 1.0)), FULL)
     assert picture[512, 512].min() > 10
     lit = (picture[..., 0] > 1).sum()
     assert lit == pytest.approx(np.pi * (np.radians(0.265) * 1400) ** 2, rel=0.2)
 
 
-def test_sirius_is_where_the_almanac_has_it():
+def test_sirius_is_where_the_almanac_has_it() -> None:
     catalogue = stars.catalogue()
     brightest = catalogue.directions[np.argmax(catalogue.flux.sum(axis=1))]
     ra, dec = np.degrees(np.arctan2(brightest[1], brightest[0])), np.degrees(np.arcsin(brightest[2]))
@@ -123,7 +123,7 @@ def test_sirius_is_where_the_almanac_has_it():
 
 
 @pytest.mark.parametrize("size", [1024, 256])
-def test_a_star_keeps_its_light_at_any_window_size(size: int):
+def test_a_star_keeps_its_light_at_any_window_size(size: int) -> None:
     catalogue = stars.catalogue()
     sirius = int(np.argmax(catalogue.flux.sum(axis=1)))
     z = catalogue.directions[sirius]

@@ -92,7 +92,7 @@ def black(shot: Shot, window: Crop) -> np.ndarray:
 
 
 def clip(radiance: np.ndarray, sensor: Sensor, scale: float, seed: int) -> np.ndarray:
-    return np.uint8(255 * np.clip(radiance, 0, 1))
+    return (255 * np.clip(radiance, 0, 1)).astype(np.uint8)
 
 
 def built(name: str, folder: Path) -> Spacecraft:
@@ -115,10 +115,8 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(out: Path, **values: Any) -> stage.Generated:
     """Render with the options, the selection and the other arguments that have these names."""
     given: dict[str, Any] = {"seed": 5, "size": 64} | values
-    options, selection = (
-        kind(**{field.name: given.pop(field.name) for field in fields(kind) if field.name in given})
-        for kind in (Options, Selection)
-    )
+    options = Options(**{field.name: given.pop(field.name) for field in fields(Options) if field.name in given})
+    selection = Selection(**{field.name: given.pop(field.name) for field in fields(Selection) if field.name in given})
     rest: dict[str, Any] = {"recipe": recipe(), "workers": 1, "variant": "scalar_rgb"} | given
     return stage.generate(out=out, options=options, selection=selection, **rest)
 
@@ -134,15 +132,18 @@ def test_keypoints_fall_on_their_discs(tmp_path: Path) -> None:
         root = tmp_path / window
         run(root, window=window, size=128, mask=True, frames=6, sequences=1)
         dataset = SkdDataset(root, spacecraft="satellite_02")
-        for frame in dataset:
+        for i, frame in enumerate(dataset):
+            image, mask_path = frame.image, dataset.extras(i).mask_path
+            assert image is not None
+            assert frame.visible is not None
+            assert mask_path is not None
             pixels = frame.keypoints_px(dataset.spacecraft.points_m)
-            for (x, y), seen in zip(pixels, frame.visible, strict=True):
+            for (x, y), visible in zip(pixels, frame.visible, strict=True):
                 inside = 0 <= x < frame.camera.width and 0 <= y < frame.camera.height
-                assert not (seen and not inside)
-                if seen:
-                    assert frame.image[int(y), int(x)].min() > 200
-        masks = [read_mask(dataset.extras(i).mask_path) for i in range(len(dataset))]
-        assert all(mask.shape == frame.image.shape[:2] for mask, frame in zip(masks, dataset, strict=True))
+                assert not (visible and not inside)
+                if visible:
+                    assert image[int(y), int(x)].min() > 200
+            assert read_mask(mask_path).shape == image.shape[:2]
         assert (root / "contact_sheet.jpg").exists()
 
 
@@ -156,6 +157,7 @@ def test_windows_are_black_beyond_the_sensor(tmp_path: Path, monkeypatch: pytest
     full_y = full_from_window[1, 1] * y + full_from_window[1, 2]
     outside = np.hypot(np.maximum(0, 8 - full_x), np.maximum(0, 8 - full_y)) > 24
     inside = (full_x > 16) & (full_y > 16)
+    assert frame.image is not None
     if outside.any():
         assert frame.image[outside].max() < 40
     assert frame.image[inside].min() > 90
@@ -173,7 +175,7 @@ def test_same_seed_same_bytes_whatever_the_order(tmp_path: Path) -> None:
 
 def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(tmp_path / "whole", sequences=1)
-    drawn = []
+    drawn: list[tuple[int, int]] = []
     paint = worker.render_frame
 
     def killed(state: worker.WorkerState, name: str, sequence: int, index: int) -> None:
@@ -240,6 +242,8 @@ def test_other_options_are_refused(tmp_path: Path) -> None:
 def test_depth_is_written_on_demand(tmp_path: Path) -> None:
     run(tmp_path, sequences=1, frames=1, depth=True)
     extras = SkdDataset(tmp_path).extras(0)
+    assert extras.depth_path is not None
+    assert extras.mask_path is not None
     depth = np.load(extras.depth_path)["depth_m"]
     assert depth.dtype == np.float32
     np.testing.assert_array_equal(depth > 0, read_mask(extras.mask_path))
@@ -311,10 +315,10 @@ def test_shards_are_parsed() -> None:
             parse_shard(text)
 
 
-def test_recipe_json_tells_what_the_folder_is(tmp_path: Path) -> None:
+def test_recipe_json_records_what_the_folder_is(tmp_path: Path) -> None:
     run(tmp_path, sequences=1, frames=1)
-    told = json.loads((tmp_path / "recipe.json").read_text())
-    assert (told["seed"], told["window"], told["recipe"]["name"]) == (5, "frame", "skd")
+    recorded = json.loads((tmp_path / "recipe.json").read_text())
+    assert (recorded["seed"], recorded["window"], recorded["recipe"]["name"]) == (5, "frame", "skd")
     assert read_image(tmp_path / "contact_sheet.jpg").shape[1] == 3 * 256
 
 
@@ -322,14 +326,14 @@ def test_a_reader_of_the_authors_rules_finds_the_keypoints_in_our_pictures(tmp_p
     run(tmp_path, size=128, recipe=recipe(sequences=15, frames=3))
     records = authors.read(tmp_path, 128)
     assert Counter(record.split for record in records) == {"train": 27, "val": 9, "test": 9}
-    seen = 0
+    count = 0
     for record in records:
         image = read_image(record.image_path)
         for x, y in record.keypoints:
             if 2 < x < 126 and 2 < y < 126:
                 assert image[int(y), int(x)].min() > 200
-                seen += 1
-    assert seen > 100
+                count += 1
+    assert count > 100
 
 
 DAMAGES: dict[str, Callable[[str], str]] = {
@@ -441,6 +445,6 @@ def test_a_mesh_of_another_scale_ends_the_job_before_its_frames(
 
 
 def test_progress_is_reported_from_start_to_end(tmp_path: Path) -> None:
-    seen: list[stage.Progress] = []
-    run(tmp_path, sequences=1, frames=2, on_progress=seen.append)
-    assert [(each.done, each.total) for each in seen] == [(0, 6), (2, 6), (4, 6), (6, 6)]
+    reported: list[stage.Progress] = []
+    run(tmp_path, sequences=1, frames=2, on_progress=reported.append)
+    assert [(each.done, each.total) for each in reported] == [(0, 6), (2, 6), (4, 6), (6, 6)]

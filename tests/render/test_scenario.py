@@ -40,7 +40,7 @@ def pixels(motion: SequenceMotion, points_m: np.ndarray) -> np.ndarray:
     return points[..., :2] / points[..., 2:] * 1400 + 512
 
 
-def test_pixels_are_those_of_the_shot():
+def test_pixels_are_those_of_the_shot() -> None:
     shot = shoot(SKD, FLEET["satellite_01"], 0, 0, 123)
     points = FLEET["satellite_01"].points_m
     projected = shot.camera.project(shot.cam_from_body.transform(points))
@@ -52,7 +52,7 @@ def skd() -> list[SequenceMotion]:
     return [solved(SKD, sequence) for sequence in range(45)]
 
 
-def test_split_is_three_to_one_to_one_for_each_spacecraft():
+def test_split_is_three_to_one_to_one_for_each_spacecraft() -> None:
     counts: dict[tuple[str, str], int] = {}
     for sequence in range(300):
         key = SKD.spacecraft_of(sequence), SKD.split_of(sequence)
@@ -60,12 +60,12 @@ def test_split_is_three_to_one_to_one_for_each_spacecraft():
     assert counts == {(name, s): k for name in SKD.spacecraft for s, k in (("train", 60), ("val", 20), ("test", 20))}
 
 
-def test_skd_limits_hold_on_every_frame(skd: list[SequenceMotion]):
+def test_skd_limits_hold_on_every_frame(skd: list[SequenceMotion]) -> None:
     points = FLEET["satellite_01"].points_m
     spans = []
     for motion in skd:
         at = pixels(motion, points)
-        inside = ((at >= 0) & (at <= 1024)).all(axis=2)
+        inside = np.all((at >= 0) & (at <= 1024), axis=2)
         spans.append(np.ptp(at, axis=1).max(axis=1) / 1024)
         assert inside.all(axis=1).mean() >= 0.9
         assert inside.sum(axis=1).min() >= len(points) / 2
@@ -76,7 +76,7 @@ def test_skd_limits_hold_on_every_frame(skd: list[SequenceMotion]):
     assert np.max(spans) > 0.7
 
 
-def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[SequenceMotion]):
+def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[SequenceMotion]) -> None:
     phase = np.degrees([motion.phase_rad.mean() for motion in skd])
     assert (np.histogram(phase, bins=4, range=(0, 130))[0] >= 5).all()
     earth = np.array([motion.earth_in_view.mean() for motion in skd])
@@ -88,7 +88,7 @@ def test_skd_spreads_phase_angle_earth_and_attitude(skd: list[SequenceMotion]):
     assert octants.min() > 0.06
 
 
-def test_neighbouring_frames_differ_a_little(skd: list[SequenceMotion]):
+def test_neighbouring_frames_differ_a_little(skd: list[SequenceMotion]) -> None:
     for motion in skd:
         step = np.einsum("tij,tij->t", motion.cam_from_body[1:], motion.cam_from_body[:-1])
         turn_deg = np.degrees(np.arccos(np.clip((step - 1) / 2, -1, 1)))
@@ -100,13 +100,13 @@ def test_neighbouring_frames_differ_a_little(skd: list[SequenceMotion]):
         assert moved.max() < 0.1
 
 
-def test_an_approach_moves_through_much_of_the_range(skd: list[SequenceMotion]):
+def test_an_approach_moves_through_much_of_the_range(skd: list[SequenceMotion]) -> None:
     ratios = [np.ptp(np.log(np.linalg.norm(m.body_cam_m, axis=1))) for m in skd if m.spec.kind == "approach"]
     assert len(ratios) >= 10
     assert np.exp(np.median(ratios)) > 2.5
 
 
-def test_hard_recipe_goes_where_skd_does_not():
+def test_hard_recipe_goes_where_skd_does_not() -> None:
     points = FLEET["satellite_01"].points_m
     motions = [solved(HARD, sequence) for sequence in range(30)]
     at = [pixels(motion, points) for motion in motions]
@@ -122,7 +122,7 @@ def test_hard_recipe_goes_where_skd_does_not():
 
 
 @pytest.mark.parametrize("sequence", [0, 7, 31])
-def test_sun_and_earth_hold_together(sequence: int):
+def test_sun_and_earth_hold_together(sequence: int) -> None:
     motion = solved(SKD, sequence)
     sun = np.einsum("tji,tj->ti", motion.cam_from_inertial, motion.sun_direction)
     np.testing.assert_allclose(sun, np.broadcast_to(sun[0], sun.shape), atol=1e-9)
@@ -152,7 +152,7 @@ def comparable(shot: Shot) -> list[object]:
     return [value for value in as_values(keep) if value is not CAMERA]
 
 
-def test_random_access_equals_sequential():
+def test_random_access_equals_sequential() -> None:
     craft = FLEET["satellite_02"]
     forward = [comparable(shoot(SKD, craft, 0, 4, index)) for index in (0, 50, 299)]
     sample_sequence.cache_clear()
@@ -161,7 +161,7 @@ def test_random_access_equals_sequential():
     assert forward == backward[::-1]
 
 
-def test_seed_sequence_and_frame_all_matter():
+def test_seed_sequence_and_frame_all_matter() -> None:
     craft = FLEET["satellite_02"]
     base = shoot(SKD, craft, 0, 4, 5)
     others = [shoot(SKD, craft, 1, 4, 5), shoot(SKD, craft, 0, 7, 5), shoot(SKD, craft, 0, 4, 6)]
@@ -170,7 +170,7 @@ def test_seed_sequence_and_frame_all_matter():
         assert base.seed != other.seed
 
 
-def test_a_shot_of_a_frame_is_complete():
+def test_a_shot_of_a_frame_is_complete() -> None:
     shot = shoot(SKD, FLEET["satellite_01"], 0, 0, 17)
     assert (shot.recipe, shot.spacecraft, shot.sequence, shot.index) == ("skd", "satellite_01", 0, 17)
     assert np.linalg.norm(shot.sun_direction) == pytest.approx(1)
@@ -180,7 +180,7 @@ def test_a_shot_of_a_frame_is_complete():
     assert (shot.earth is not None) == bool(solved(SKD, 0).earth_in_view[17])
 
 
-def test_out_of_range_is_refused():
+def test_out_of_range_is_refused() -> None:
     with pytest.raises(GknetError, match="sequence"):
         shoot(SKD, FLEET["satellite_01"], 0, 300, 0)
     with pytest.raises(GknetError, match="frame"):
@@ -189,14 +189,14 @@ def test_out_of_range_is_refused():
         SKD.split_of(-1)
 
 
-def test_limits_that_nothing_obeys_are_named(monkeypatch: pytest.MonkeyPatch):
+def test_limits_that_nothing_obeys_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gknet.render.sequence._ATTEMPTS", 20)
     motion = SKD.motion.model_copy(update={"span": (0.5, 0.501)})
     with pytest.raises(GknetError, match="obeys its limits"):
         sample_sequence(SKD.model_copy(update={"motion": motion, "name": "narrow"}), FLEET["satellite_01"], 0, 0)
 
 
-def test_recipe_file_round_trip_and_bad_ones(tmp_path: Path):
+def test_recipe_file_round_trip_and_bad_ones(tmp_path: Path) -> None:
     import gknet.render.recipe as module
 
     text = (Path(module.__file__).parent / "recipes" / "skd.toml").read_text()

@@ -28,50 +28,50 @@ def flat(value: float, size: int = 128) -> np.ndarray:
 
 
 @pytest.mark.parametrize("value", [0.1, 0.35, 0.8])
-def test_mean_is_linear_below_saturation(value: float):
+def test_mean_is_linear_below_saturation(value: float) -> None:
     assert expose(flat(value), PLAIN, 1.0, 1).mean() / 255 == pytest.approx(value, abs=0.002)
 
 
-def test_exposure_scales_and_saturates():
+def test_exposure_scales_and_saturates() -> None:
     assert expose(flat(0.4), replace(PLAIN, exposure=0.5), 1.0, 1).mean() / 255 == pytest.approx(0.8, abs=0.002)
     assert expose(flat(0.4), replace(PLAIN, exposure=0.2), 1.0, 1).min() == 255
 
 
-def test_gamma_is_the_inverse_power():
+def test_gamma_is_the_inverse_power() -> None:
     picture = expose(flat(0.25), replace(PLAIN, gamma=2.0), 1.0, 1)
     assert picture.mean() / 255 == pytest.approx(0.5, abs=0.003)
 
 
-def test_veil_adds_everywhere():
+def test_veil_adds_everywhere() -> None:
     assert expose(flat(0.2), replace(PLAIN, veil=0.1), 1.0, 1).mean() / 255 == pytest.approx(0.3, abs=0.002)
 
 
-def test_noise_is_shot_and_read_noise():
+def test_noise_is_shot_and_read_noise() -> None:
     noisy = replace(PLAIN, full_well_e=1000.0, read_noise_e=30.0)
     expected = np.sqrt(0.5 * 1000 + 30**2) / 1000
     assert expose(flat(0.5), noisy, 1.0, 3).std() / 255 == pytest.approx(expected, rel=0.03)
 
 
-def test_noise_at_half_scale_is_halved():
+def test_noise_at_half_scale_is_halved() -> None:
     noisy = replace(PLAIN, full_well_e=1000.0)
     full, half, double = (expose(flat(0.5), noisy, scale, 3).std() for scale in (1.0, 0.5, 2.0))
     assert half / full == pytest.approx(0.5, rel=0.05)
     assert double == pytest.approx(full, rel=0.05)
 
 
-def test_the_seed_decides():
+def test_the_seed_decides() -> None:
     same, again, other = (expose(flat(0.5), PLAIN, 1.0, seed) for seed in (7, 7, 8))
     np.testing.assert_array_equal(same, again)
     assert (same != other).any()
 
 
-def test_input_is_left_alone():
+def test_input_is_left_alone() -> None:
     light = flat(0.5)
     expose(light, PLAIN, 1.0, 0)
     assert (light == 0.5).all()
 
 
-def test_monochrome_is_grey_luminance():
+def test_monochrome_is_grey_luminance() -> None:
     light = flat(0.0)
     light[..., 1] = 0.5
     picture = expose(light, replace(PLAIN, monochrome=True), 1.0, 0)
@@ -79,7 +79,7 @@ def test_monochrome_is_grey_luminance():
     assert picture.mean() / 255 == pytest.approx(0.7152 * 0.5, abs=0.003)
 
 
-def test_bloom_reaches_far_and_grows_with_the_light():
+def test_bloom_reaches_far_and_grows_with_the_light() -> None:
     def around(peak: float) -> float:
         light = flat(0.0)
         light[60:68, 60:68] = peak
@@ -88,7 +88,7 @@ def test_bloom_reaches_far_and_grows_with_the_light():
     assert around(20.0) > around(5.0) > 0
 
 
-def test_psf_spreads_a_point_but_keeps_its_light():
+def test_psf_spreads_a_point_but_keeps_its_light() -> None:
     light = flat(0.1)
     light[64, 64] = 0.8
     clean = replace(PLAIN, bloom=0.0, full_well_e=1e8, read_noise_e=0.1, psf_sigma_px=1.0)
@@ -97,7 +97,7 @@ def test_psf_spreads_a_point_but_keeps_its_light():
     assert (picture - 0.1)[58:71, 58:71].sum() == pytest.approx(0.7, abs=0.1)
 
 
-def test_a_window_of_half_scale_looks_like_the_full_one_averaged():
+def test_a_window_of_half_scale_looks_like_the_full_one_averaged() -> None:
     rng = np.random.default_rng(0)
     light = np.repeat(np.repeat(rng.random((16, 16, 3), dtype=np.float32), 16, 0), 16, 1)
     soft = replace(PLAIN, psf_sigma_px=2.0, bloom=0.05, full_well_e=1e7, read_noise_e=1.0)
@@ -106,6 +106,6 @@ def test_a_window_of_half_scale_looks_like_the_full_one_averaged():
     assert np.abs(full - half).mean() < 2
 
 
-def test_bad_scale_is_refused():
+def test_bad_scale_is_refused() -> None:
     with pytest.raises(GknetError, match="scale"):
         expose(flat(0.1), PLAIN, 0.0, 0)

@@ -104,8 +104,8 @@ def assert_all_end(group: int) -> None:
     ("number", "workers", "is_to_group"),
     [
         (signal.SIGTERM, 2, False),
-        (signal.SIGTERM, 2, True),
-        (signal.SIGINT, 2, True),
+        pytest.param(signal.SIGTERM, 2, True, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 2, True, marks=pytest.mark.slow),
         (signal.SIGINT, 1, False),
         (signal.SIGHUP, 1, False),
     ],
@@ -124,6 +124,7 @@ def test_a_stop_signal_ends_workers_and_keeps_frames(
     assert (number is signal.SIGTERM and is_to_group) or not list(out.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_a_killed_render_leaves_no_worker_and_goes_on(out: Path) -> None:
     process = under_way(out, 2)
     process.kill()
@@ -139,6 +140,7 @@ def test_a_killed_render_leaves_no_worker_and_goes_on(out: Path) -> None:
     assert len(SkdDataset(out)) == most
 
 
+@pytest.mark.slow
 def test_two_renders_into_one_folder_share_it(out: Path) -> None:
     """The same sequence at once with other frames: every frame has its picture and its label."""
     calls = [[*command(out, 1), "--frames", "12", "--every", every, "--first", "1"] for every in ("1", "3")]
