@@ -25,6 +25,6 @@ def terminal(folder: Path) -> dict[str, str]:
 def read(page: str, folder: Path, *languages: str) -> str:
     """Run a page's blocks in `folder`; what they print."""
     command = [sys.executable, "-m", "tests.docs.run_page", str(ROOT / "docs" / page), *languages]
-    run = subprocess.run(command, cwd=folder, env=terminal(folder), capture_output=True, text=True, timeout=900)
+    run = subprocess.run(command, cwd=folder, env=terminal(folder), capture_output=True, text=True, timeout=1800)
     assert run.returncode == 0, f"{page}\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
     return run.stdout
