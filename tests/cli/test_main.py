@@ -112,3 +112,9 @@ def test_process_exits_with_the_code(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "nobody" in done.stderr
+
+
+@pytest.mark.parametrize("folder", ["experiments", "benchmarks", "examples"])
+def test_no_command_is_taken_for_a_library(folder: str) -> None:
+    for path in (Path(__file__).parents[2] / folder).rglob("*.py"):
+        assert "gknet.cli" not in path.read_text(encoding="utf-8"), path

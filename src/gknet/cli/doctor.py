@@ -25,7 +25,7 @@ _ENOUGH_BYTES = 1_000_000_000
 
 
 class CheckStatus(StrEnum):
-    """`note` is worth knowing and no fault; `bad` makes the command end with code 2."""
+    """How a check went: `note` is worth knowing and no fault; `bad` makes the command end with code 2."""
 
     good = "ok"
     note = "note"
@@ -34,7 +34,14 @@ class CheckStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check. `remedy` is what to do, where something can be done."""
+    """The result of one check.
+
+    Attributes:
+        what: Was checked.
+        status: How it went.
+        words: What was found.
+        remedy: What to do, where something can be done.
+    """
 
     what: str
     status: CheckStatus

@@ -9,7 +9,18 @@ from gknet.errors import GknetError, MissingExtraError
 
 
 def load_torch_file(path: Path) -> object:
-    """Tensors on the CPU, numbers, texts, lists and dicts of them; GknetError for anything else."""
+    """The content of a file that torch.save wrote.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Tensors on the CPU, numbers, texts, lists and dicts of them.
+
+    Raises:
+        GknetError: The file cannot be read, or holds anything else.
+        MissingExtraError: torch is not installed.
+    """
     try:
         import torch
     except ImportError as error:

@@ -18,7 +18,14 @@ _LEAST_SIDE_PX = 768
 
 
 def enlarged(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"], int]:
-    """A copy fit to draw on, and the whole factor by which a small image was enlarged."""
+    """A copy fit to draw on.
+
+    Args:
+        image: (h, w, 3) RGB, which is left as it is.
+
+    Returns:
+        The copy, and the whole factor by which a small image was enlarged.
+    """
     factor = max(1, round(_LEAST_SIDE_PX / max(image.shape[:2])))
     if factor == 1:
         return np.ascontiguousarray(image).copy(), 1
@@ -27,9 +34,15 @@ def enlarged(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"],
 
 @dataclass
 class Canvas:
-    """Draws in place on `image`; coordinates are pixels whose top-left centre is (0.5, 0.5), times `factor`.
+    """Draws in place on `image`.
 
-    Widths and sizes are in units of 1/1024 of the image's longer side, times `weight`.
+    Coordinates are in px of the image before it was enlarged; its top-left pixel has its centre at (0.5, 0.5). Widths
+    and sizes are in units of 1/1024 of the image's longer side, times `weight`.
+
+    Attributes:
+        image: (h, w, 3) RGB.
+        factor: By which the image was enlarged.
+        weight: Of lines, marks and text.
     """
 
     image: UInt8[ndarray, "h w 3"]
@@ -55,7 +68,7 @@ class Canvas:
         cv2.line(self.image, self._fixed(a), self._fixed(b), colour, width, cv2.LINE_AA, _SHIFT)
 
     def line(self, a: Float[ndarray, "2"], b: Float[ndarray, "2"], colour: RGB, width: float = 2.0) -> None:
-        """A segment; nothing when an end is not finite or far away."""
+        """A segment from `a` to `b`, each (2,) in px; nothing when an end is not finite or far away."""
         if not self._drawable(a, b):
             return
         inner = self._width(width)
@@ -93,6 +106,7 @@ class Canvas:
         cv2.fillConvexPoly(self.image, corners, colour, cv2.LINE_AA, _SHIFT)
 
     def disc(self, centre: Float[ndarray, "2"], colour: RGB, radius: float = 5.5) -> None:
+        """A filled circle."""
         if not self._drawable(centre):
             return
         size = radius * self.unit * (1 << _SHIFT)
@@ -101,6 +115,7 @@ class Canvas:
         cv2.circle(self.image, self._fixed(centre), round(size), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
 
     def ring(self, centre: Float[ndarray, "2"], colour: RGB, radius: float = 5.5, width: float = 1.7) -> None:
+        """An open circle."""
         if not self._drawable(centre):
             return
         size, inner = round(radius * self.unit * (1 << _SHIFT)), self._width(width)
@@ -109,25 +124,26 @@ class Canvas:
         cv2.circle(self.image, self._fixed(centre), size, colour, inner, cv2.LINE_AA, _SHIFT)
 
     def cross(self, centre: Float[ndarray, "2"], colour: RGB, radius: float = 5.5) -> None:
+        """Two diagonal segments."""
         reach = radius * self.unit / self.factor
         for dx, dy in ((reach, reach), (reach, -reach)):
             offset = np.array([dx, dy])
             self.line(centre - offset, centre + offset, colour, 2.0)
 
     def text_width(self, text: str, size: float, weight: int = 500) -> float:
-        """Width of a line of text in image pixels."""
+        """Width of a line of text, in px of the enlarged image."""
         pixels = round(size * self.unit)
         return cv2.getTextSize((0, 0), printable(text), (0, 0), self._font, pixels, weight)[2]
 
     def text(
         self, text: str, corner: Float[ndarray, "2"], colour: RGB = WHITE, size: float = 20, weight: int = 500
     ) -> None:
-        """A line of text with its baseline's left end at `corner`, in image pixels of the enlarged image."""
+        """A line of text with its baseline's left end at `corner`, in px of the enlarged image."""
         origin = (round(float(corner[0])), round(float(corner[1])))
         cv2.putText(self.image, printable(text), origin, colour, self._font, round(size * self.unit), weight)
 
     def label(self, text: str, centre: Float[ndarray, "2"], colour: RGB, size: float = 20) -> None:
-        """Short outlined text centred on a point of the image."""
+        """Short outlined text centred on a point of the image, (2,) in px."""
         if not self._drawable(centre):
             return
         half = self.text_width(text, size, 700) / 2
@@ -139,7 +155,7 @@ class Canvas:
         self.text(text, np.array([x, y]), colour, size, 700)
 
     def shade(self, x0: float, y0: float, x1: float, y1: float, strength: float = 0.62) -> None:
-        """Darken a rectangle of image pixels, so that text on it can be read."""
+        """Darken a rectangle, in px of the enlarged image, so that text on it can be read; `strength` is 0 to 1."""
         rows = slice(max(0, round(y0)), max(0, round(y1)))
         columns = slice(max(0, round(x0)), max(0, round(x1)))
         patch = self.image[rows, columns].astype(np.float32)

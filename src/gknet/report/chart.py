@@ -21,7 +21,15 @@ _CHARACTER = 6.6
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One curve. With `low` and `high` (k,) its points carry whiskers."""
+    """One curve, or one colour of bars.
+
+    Attributes:
+        name: In the legend; an empty one is left out.
+        x: (k,) values across; bars leave them out of account.
+        y: (k,) values up, or lengths of the bars; what is not finite is not drawn.
+        low: (k,) lower ends of whiskers; None for none.
+        high: (k,) upper ends of whiskers; None for none.
+    """
 
     name: str
     x: Float[ndarray, " k"]
@@ -32,7 +40,14 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """`low` and `high` are taken from the data where they are None."""
+    """An axis of a chart.
+
+    Attributes:
+        label: With the unit.
+        log: Logarithmic.
+        low: The first value; None takes it from the data.
+        high: The last value; None takes it from the data.
+    """
 
     label: str
     log: bool = False
@@ -63,7 +78,20 @@ class _Scale:
 
 
 def curve_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
-    """Curves; those with whiskers show their points too. An <svg> element, or a note where there is nothing to draw."""
+    """A chart of curves; those with whiskers show their points too.
+
+    Args:
+        title: Above the chart.
+        x: The axis across.
+        y: The axis up.
+        series: The curves.
+
+    Returns:
+        An <svg> element, with a note where there is nothing to draw.
+
+    Raises:
+        GknetError: A logarithmic axis starts at 0 or below.
+    """
     shown = [s for s in series if np.isfinite(s.y).any()]
     if not shown:
         return empty_chart(title, "no data")
@@ -76,7 +104,17 @@ def curve_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
 
 
 def bar_chart(title: str, value: Axis, names: Sequence[str], series: Sequence[Series]) -> str:
-    """Horizontal bars, one group a name; `Series.y` are the bars, `x` is not used, whiskers run from low to high."""
+    """A chart of horizontal bars.
+
+    Args:
+        title: Above the chart.
+        value: The axis across.
+        names: One for each group of bars.
+        series: One for each bar of a group; whiskers run from `low` to `high`.
+
+    Returns:
+        An <svg> element, with a note where there is nothing to draw.
+    """
     if not names:
         return empty_chart(title, "no data")
     left = min(220.0, 24 + _CHARACTER * max(len(name) for name in names))
@@ -102,10 +140,12 @@ def standalone(chart: str) -> str:
 
 
 def page_style() -> str:
+    """The style sheet of page and charts."""
     return (resources.files("gknet.report") / "page.css").read_text(encoding="utf-8")
 
 
 def empty_chart(title: str, note: str) -> str:
+    """A chart with a note instead of data."""
     middle = f'<text x="{_WIDTH / 2}" y="90" text-anchor="middle" class="quiet">{escaped(note)}</text>'
     return _svg(title, middle, 150)
 

@@ -27,7 +27,13 @@ _WEIGHT = 1.6
 
 @dataclass(frozen=True)
 class GalleryPicture:
-    """A captioned JPEG as a data URI."""
+    """A picture of a gallery.
+
+    Attributes:
+        data_uri: A JPEG.
+        title: The frame's name.
+        caption: Its conditions and errors.
+    """
 
     data_uri: str
     title: str
@@ -36,12 +42,24 @@ class GalleryPicture:
 
 @dataclass(frozen=True)
 class Gallery:
+    """Pictures under a title."""
+
     title: str
     pictures: tuple[GalleryPicture, ...]
 
 
 def galleries(run: ProtocolRun, dataset: SkdDataset, spacecraft: Spacecraft, count: int = 6) -> tuple[Gallery, ...]:
-    """Worst, random and best by the SPEED score; a frame appears in one gallery only."""
+    """Worst, random and best frames by the SPEED score; a frame appears in one gallery only.
+
+    Args:
+        run: The errors.
+        dataset: Where the frames are read from.
+        spacecraft: That is drawn.
+        count: Pictures in each gallery.
+
+    Raises:
+        GknetError: A frame cannot be read any more.
+    """
     order = sorted(run.cases, key=lambda case: (-case.errors.speed_score, case.index))
     worst = order[:count]
     best = order[count:][::-1][:count]
@@ -55,7 +73,7 @@ def galleries(run: ProtocolRun, dataset: SkdDataset, spacecraft: Spacecraft, cou
 
 
 def data_uri(image: UInt8[ndarray, "h w 3"], quality: int = _QUALITY) -> str:
-    """An RGB image as an inline JPEG."""
+    """An RGB image (h, w, 3) as an inline JPEG; `quality` is 1 to 100."""
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise GknetError("gallery: a picture could not be encoded")

@@ -35,12 +35,22 @@ def draw_overlay(
     legend: bool = True,
     weight: float = 1.0,
 ) -> UInt8[ndarray, "h w 3"]:
-    """The frame's image (small ones are enlarged by a whole factor) with the estimate and, when known, the truth.
+    """Draw an estimate, and the truth where it is known, on a copy of the frame's image.
 
-    lines    the words of the panel; None writes `describe(frame, estimate)`
-    truth    draw the true skeleton too, where the frame has a pose
-    legend   explain the marks along the lower edge
-    weight   of lines, marks and words; more than 1 for a picture that will be shown small
+    Args:
+        frame: The picture with its camera.
+        spacecraft: Whose skeleton is drawn.
+        estimate: Of the pose.
+        lines: The text of the panel; None writes `describe(frame, estimate)`.
+        truth: Draw the true skeleton too, where the frame has a pose.
+        legend: Explain the marks along the lower edge.
+        weight: Of lines, marks and text; more than 1 for a picture that is shown small.
+
+    Returns:
+        (h, w, 3) RGB; a small image is enlarged by a whole factor.
+
+    Raises:
+        GknetError: The frame has no image.
     """
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: an overlay needs its image")
@@ -99,7 +109,16 @@ def confidence(estimate: Estimate) -> float | None:
 
 
 def zoomed(frame: Frame, estimate: Estimate, crop: Crop) -> tuple[Frame, Estimate]:
-    """The frame and its estimate in the pixels of a crop; the camera of the frame must be undistorted."""
+    """The frame and its estimate in the pixels of a crop.
+
+    Args:
+        frame: With an image, and a camera without distortion.
+        estimate: In px of the frame's image.
+        crop: Of the frame's image.
+
+    Raises:
+        GknetError: The frame has no image.
+    """
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: a zoom needs its image")
     camera = frame.camera.warped(crop.input_from_image, crop.size, crop.size)

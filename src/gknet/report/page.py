@@ -26,14 +26,19 @@ from gknet.report.table import (
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """An evaluation with its galleries, by the words they are shown under."""
+    """One spacecraft's part of the page.
+
+    Attributes:
+        evaluation: The errors.
+        galleries: Pictures, in the order of the page.
+    """
 
     evaluation: Evaluation
     galleries: tuple[Gallery, ...] = ()
 
 
 def page(title: str, sections: Sequence[Section]) -> str:
-    """The whole page; every number in its tables carries its full value in `data-value`."""
+    """The whole page as HTML; every number in its tables carries its full value in `data-value`."""
     body = "".join(_section(section) for section in sections)
     links = "".join(
         f'<a href="#{escaped(s.evaluation.spacecraft.name)}">{escaped(s.evaluation.spacecraft.name)}</a>'

@@ -15,7 +15,15 @@ from gknet.io.text import printable
 
 @dataclass(frozen=True)
 class Row:
-    """A metric as it is shown: `digits` after the point, `meaning` in one line."""
+    """A metric as it is shown.
+
+    Attributes:
+        metric: Its key in a summary.
+        title: Its name in tables.
+        unit: Of its values.
+        digits: After the decimal point.
+        meaning: In one line.
+    """
 
     metric: str
     title: str
@@ -63,19 +71,22 @@ def statistic(run: ProtocolRun, metric: str) -> Statistic | None:
 
 
 def interval_text(found: Statistic | None, digits: int) -> str:
-    """mean [low, high]"""
+    """The mean with its 95 % interval, "mean [low, high]"; "-" for None."""
     return "-" if found is None else f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
 def median_text(found: Statistic | None, digits: int) -> str:
+    """The median; "-" for None."""
     return "-" if found is None else f"{found.median:.{digits}f}"
 
 
 def failure_count(run: ProtocolRun) -> int:
+    """Frames without a pose."""
     return sum(run.summary.failures.values())
 
 
 def percent_text(part: float | None) -> str:
+    """A share, 0 to 1, in per cent; "-" for None."""
     return "-" if part is None else f"{100 * part:.1f} %"
 
 
