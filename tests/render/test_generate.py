@@ -25,7 +25,7 @@ from gknet.io.image import read_image, read_mask
 from gknet.io.spacecraft_file import save_spacecraft
 from gknet.render import generate as stage
 from gknet.render import worker
-from gknet.render.journal import JOURNAL
+from gknet.render.journal import JOURNAL, append_row
 from gknet.render.options import Options, Selection, parse_shard
 from gknet.render.plan import FILM_SIZES, plan_sequences, target_window
 from gknet.render.recipe import Recipe, load_recipe
@@ -223,6 +223,15 @@ def test_a_full_disk_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(worker, "render_frame", full)
     with pytest.raises(OSError, match="No space"):
         run(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full")
+def test_a_journal_that_cannot_grow_ends_the_job_and_is_named(tmp_path: Path) -> None:
+    run(tmp_path, sequences=1, frames=1)
+    (tmp_path / "data/000002" / JOURNAL).symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space") as caught:
+        append_row(tmp_path / "data/000002" / JOURNAL, {"frame": "1"})
+    assert caught.value.filename == str(tmp_path / "data/000002" / JOURNAL)
 
 
 def test_other_options_are_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterator
@@ -9,19 +10,26 @@ from pathlib import Path
 
 from gknet.dataset.skd_format import AUTHORS_COLUMNS, OUR_COLUMNS, annotation_from
 from gknet.errors import GknetError
+from gknet.io.atomic import naming
 from gknet.io.text import parse_json
 
 JOURNAL = "journal.jsonl"
 
 
 def append_row(journal: Path, row: dict[str, str]) -> None:
-    """Append a row in one write. A line starts with its newline, so that one cut off by a kill spoils no other."""
-    line = "\n" + json.dumps(row)
-    handle = os.open(journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(handle, line.encode("utf-8"))
-    finally:
-        os.close(handle)
+    """Append a row in one write. A line starts with its newline, so that one cut off by a kill spoils no other.
+
+    Raises:
+        OSError: The disk is full or the file cannot be written; the error names it.
+    """
+    line = ("\n" + json.dumps(row)).encode()
+    with naming(journal):
+        handle = os.open(journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            if os.write(handle, line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        finally:
+            os.close(handle)
 
 
 def read_journal(journal: Path, frames: int, keypoint_count: int) -> Iterator[dict[str, str]]:
