@@ -23,7 +23,11 @@ def _known(name: str) -> str:
 
 
 def load(name: str) -> Spacecraft:
-    """A spacecraft of the fleet by its shipped .toml; its mesh_path is None unless the GLB lies beside it."""
+    """A spacecraft of the fleet by its shipped .toml; its mesh_path is None unless the GLB is beside it.
+
+    Raises:
+        GknetError: The fleet has no spacecraft of that name.
+    """
     spacecraft = load_spacecraft(Path(__file__).parent / f"{_known(name)}.toml")
     if spacecraft.mesh_path is not None and not spacecraft.mesh_path.exists():
         return replace(spacecraft, mesh_path=None)
@@ -31,7 +35,12 @@ def load(name: str) -> Spacecraft:
 
 
 def build(name: str, folder: str | Path) -> Spacecraft:
-    """Write <folder>/<name>.glb and <name>.toml, the same bytes every time; needs gknet[render]."""
+    """Write <folder>/<name>.glb and <name>.toml, the same bytes every time.
+
+    Raises:
+        GknetError: The fleet has no spacecraft of that name.
+        MissingExtraError: The extra `render` is not installed.
+    """
     module = f"gknet.fleet.{_known(name)}"
     try:
         craft = import_module(module)

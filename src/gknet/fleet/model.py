@@ -26,7 +26,16 @@ CREASE_RAD = np.deg2rad(35)
 
 @dataclass
 class Model:
-    """Parts are added in frames of their own and kept in the body frame, in metres."""
+    """A spacecraft in the making; parts are added in frames of their own and kept in the body frame, in metres.
+
+    Attributes:
+        name: Such as satellite_01.
+        description: One sentence for people.
+        symmetries: Rotations that leave its appearance nearly unchanged.
+        parts: Meshes by (part, material).
+        keypoints: (3,) points by name.
+        edges: Pairs of keypoint names.
+    """
 
     name: str
     description: str
@@ -43,9 +52,15 @@ class Model:
         at: Float[ndarray, "4 4"] | None = None,
         around: bool = False,
     ) -> None:
-        """Put solids of one material on the craft. Their texture is laid in the local frame, then `at` places them.
+        """Put solids of one material on the spacecraft.
 
-        `around` wraps the texture about the local z axis, for cylinders; otherwise it is laid flat on each side.
+        Args:
+            part: Name of the part that they belong to.
+            material: Its texture is laid in the local frame.
+            solids: Closed meshes in the local frame, in metres.
+            at: (4, 4) body_from_local, the identity by default.
+            around: Whether the texture is wrapped about the local z axis, for cylinders; otherwise it is laid flat on
+                each side.
         """
         mesh = joined(*solids)
         mesh.merge_vertices()
@@ -55,7 +70,7 @@ class Model:
         self.parts.setdefault((part, material.name), []).append(placed)
 
     def mark(self, name: str, point: Point, at: Float[ndarray, "4 4"] | None = None) -> None:
-        """Name a keypoint."""
+        """Name a keypoint, a point of the local frame that `at` (body_from_local) places."""
         self.keypoints[name] = point_of(np.eye(4) if at is None else at, point)
 
     def link(self, *chain: str) -> None:
@@ -71,6 +86,7 @@ class Model:
         return scene
 
     def spacecraft(self, mesh_path: Path | None = None) -> Spacecraft:
+        """What is built so far, lengths rounded to a tenth of a millimetre."""
         names = tuple(self.keypoints)
         index = {name: k for k, name in enumerate(names)}
         vertices = np.vstack([mesh.vertices for meshes in self.parts.values() for mesh in meshes])
