@@ -8,7 +8,6 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 import pytest
-from packaging.markers import default_environment
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
@@ -41,7 +40,7 @@ def needed(extras: tuple[str, ...]) -> set[str]:
             continue
         wanted: list[str] = [*requirement.extras, ""]
         for each in further:
-            if each.marker is None or any(each.marker.evaluate({**default_environment(), "extra": e}) for e in wanted):
+            if each.marker is None or any(each.marker.evaluate({"extra": e}) for e in wanted):
                 pending.append(each)
     return found
 
