@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from numpy import ndarray
 
 from gknet.dataset.demo_frames import bundled_frames
@@ -38,6 +39,12 @@ METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
 FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
 
+def image_of(frame: Frame) -> UInt8[ndarray, "h w 3"]:
+    """The picture of a frame that was read with it."""
+    assert frame.image is not None
+    return frame.image
+
+
 def craft_close(frame: Frame, spacecraft: Spacecraft) -> Frame:
     """The frame in its oracle crop."""
     near, _ = zoomed(
@@ -49,7 +56,7 @@ def craft_close(frame: Frame, spacecraft: Spacecraft) -> Frame:
 def definition(frame: Frame, spacecraft: Spacecraft) -> ndarray:
     """The true skeleton with a number at each keypoint."""
     near = craft_close(frame, spacecraft)
-    canvas = Canvas(near.image.copy())
+    canvas = Canvas(image_of(near).copy())
     pixels = near.keypoints_px(spacecraft.points_m)
     for i, j in spacecraft.edges:
         canvas.line(pixels[i], pixels[j], SKY, 1.5)
@@ -73,17 +80,23 @@ def write_jpeg(path: Path, image: ndarray) -> None:
     print(f"wrote {path}")
 
 
+def visible_and_near(frame: Frame) -> tuple[int, float]:
+    """How well a frame shows its spacecraft: the visible keypoints, then the nearness."""
+    assert frame.visible is not None
+    assert frame.range_m is not None
+    return int(frame.visible.sum()), -frame.range_m
+
+
 def keypoint_figure() -> ndarray:
     """A row of definitions and two rows of whole frames."""
     rows: list[list[ndarray]] = [[], [], []]
     for name in NAMES:
         dataset = SkdDataset(bundled_frames(), None, name)
         frames = [dataset.frame(i) for i in range(len(dataset))]
-        # the frame in which most keypoints are seen, the larger the better
-        best = max(frames, key=lambda f: (f.visible.sum(), -np.linalg.norm(f.cam_from_body.translation_m)))
+        best = max(frames, key=visible_and_near)
         rows[0].append(definition(best, dataset.spacecraft))
         for row, frame in zip(rows[1:], (frames[0], frames[-1]), strict=True):
-            row.append(cv2.resize(frame.image, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
+            row.append(cv2.resize(image_of(frame), (SIDE, SIDE), interpolation=cv2.INTER_AREA))
     return sheet(rows)
 
 
@@ -94,7 +107,7 @@ def overlay_figures() -> list[ndarray]:
         dataset, estimator = SkdDataset(bundled_frames(), None, name), load_estimator(name)
         column = []
         for frame in dataset:
-            estimate = estimator.estimate(frame.image, frame.camera)
+            estimate = estimator.estimate(image_of(frame), frame.camera)
             near, close = zoomed(frame, estimate, oracle_crop(frame, dataset.spacecraft, SIDE))
             drawn = draw_overlay(near, dataset.spacecraft, close, [name], legend=False, weight=1.3)
             column.append(cv2.resize(drawn, (MOVING_SIDE, MOVING_SIDE), interpolation=cv2.INTER_AREA))
@@ -107,7 +120,7 @@ def write_moving(path: Path, pictures: list[ndarray], fps: float = 4.0) -> None:
     there_and_back = [*pictures, *pictures[-2:0:-1]]
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(picture[:, :, ::-1]) for picture in there_and_back]
-    animation.durations = np.full(len(there_and_back), round(1000 / fps), dtype=np.int32)
+    animation.durations = [round(1000 / fps)] * len(there_and_back)
     found, data = cv2.imencodeanimation(".webp", animation, [cv2.IMWRITE_WEBP_QUALITY, 70])
     if not found:
         raise GknetError(f"{path}: this OpenCV cannot write an animated WebP")
@@ -132,7 +145,7 @@ def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequ
         for place in places:
             frame = dataset.frame(place)
             box = frame.true_box(spacecraft.points_m)
-            estimates = {m: e.estimate(frame.image, frame.camera, box) for m, e in estimators.items()}
+            estimates = {m: e.estimate(image_of(frame), frame.camera, box) for m, e in estimators.items()}
             rmse = {m: compute_errors(frame, estimate, spacecraft).rmse_px for m, estimate in estimates.items()}
             found.append((float(np.mean(list(rmse.values()))), frame, estimates, rmse))
         found.sort(key=lambda item: item[0])

@@ -52,14 +52,14 @@ PROTOCOLS = {
 }
 ORDER = ("DMANet", "HRNet", "ResUNet", "GKNet")
 DIRECT = "DMANet"
-"""It detects no keypoints: in table 1, from which the paper leaves it out, are those that its pose tells."""
+"""It detects no keypoints: table 1, from which the paper leaves it out, has those that its pose projects."""
 GRAPHS = ("GKNet", "GKNet, no edges", "GKNet, random edges", "GKNet, no graph branch")
 
 METRICS = ("rmse_px", "rmse_hidden_px", "rmse_low_px", "swapped", "e_t", "e_q_rad")
 """What a trial knows of each frame, and what the graphs are compared by."""
 
 COSTS = ("parameters", "gmac", "ms", "learning_rate", "samples", "minutes", "curve")
-"""What a result tells of its training, beside its trials."""
+"""What a result holds of its training, beside its trials."""
 
 Trials = dict[tuple[str, str, str], list[Trial]]
 """(name, spacecraft, protocol) -> one for each seed"""
@@ -204,7 +204,7 @@ def cost_table(costs: dict[str, list[dict]]) -> str:
                 str(len(found)),
             ]
         )
-    header = ["method", "parameters", "GMAC a crop", "ms a crop", "learning rate", "pictures seen", "minutes"]
+    header = ["method", "parameters", "GMAC a crop", "ms a crop", "learning rate", "pictures", "minutes"]
     return markdown([*header, "trainings"], rows)
 
 
@@ -215,15 +215,15 @@ def curve_table(costs: dict[str, list[dict]]) -> str:
         for content in found:
             curves[content["spacecraft"], name].append(content["curve"])
     rows = []
-    for (spacecraft, name), found in sorted(curves.items()):
-        pictures, rmse = np.mean(found, axis=0).T  # (validations, 2)
+    for (spacecraft, name), each in sorted(curves.items()):
+        pictures, rmse = np.mean(each, axis=0).T  # (validations, 2)
         words = ", ".join(f"{value:.1f}" for value in rmse)
-        rows.append([spacecraft, name, words, f"{pictures[-1]:.0f}", str(len(found))])
-    return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "pictures seen there", "seeds"], rows)
+        rows.append([spacecraft, name, words, f"{pictures[-1]:.0f}", str(len(each))])
+    return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "pictures by then", "seeds"], rows)
 
 
 def graph_table(trials: Trials, words: Callable[[list[Trial]], str], protocol: str = "oracle") -> str:
-    """What `words` says of the trials of each graph on each spacecraft."""
+    """The trials of each graph on each spacecraft, summarised by `words`."""
     rows = []
     for name in GRAPHS:
         found = [trials.get((name, spacecraft, protocol)) for spacecraft in NAMES]
@@ -233,7 +233,7 @@ def graph_table(trials: Trials, words: Callable[[list[Trial]], str], protocol: s
 
 def swaps(found: list[Trial]) -> str:
     """Of the detections that lie at a keypoint: at their own, at another one (a swap)."""
-    matrix = sum(trial.confusion for trial in found)
+    matrix = np.sum([trial.confusion for trial in found], axis=0)
     right, all_near = np.trace(matrix), matrix.sum()
     return f"{right} right, {all_near - right} swapped ({100 * (1 - right / max(all_near, 1)):.1f} %)"
 
@@ -294,7 +294,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
         "## The graph on hidden keypoints, RMSE in px\n" + rmse_table(trials, GRAPHS, "oracle", "rmse_hidden_px")
     )
     parts.append(
-        f"## The graph where less than {100 * LOW_VISIBILITY:.0f} % of the keypoints are seen, RMSE in px\n"
+        f"## The graph where less than {100 * LOW_VISIBILITY:.0f} % of the keypoints are visible, RMSE in px\n"
         + rmse_table(trials, GRAPHS, "oracle", "rmse_low_px")
     )
     parts.append("## The skeleton less the other graphs, paired by frame\n")

@@ -4,13 +4,13 @@
     python experiments/paper_tables.py --scale cpu --work runs/paper --results results/paper_tables
     python experiments/paper_report.py --scale cpu --results results/paper_tables
 
---scale smoke  a few minutes: shows that every stage works, says nothing about the methods
+--scale smoke  a few minutes: shows that every stage works and nothing about the methods
 --scale cpu    2 cores: every method at 0.26 GMAC for a 256 crop, from scratch, the same crops and as many
                of them, and the same sweep of learning rates on validation; loss and read-out are ours for all
 --scale full   a GPU: the paper's sizes and its training (squared error, Adam 0.01, 80 epochs, batch 16, five cosines,
                32x32 heatmaps) on every frame of the 300 sequences
 
-DMANet tells the pose directly: it has its own loss, no heatmaps, and so not the paper's read-out of them.
+DMANet regresses the pose directly: it has its own loss, no heatmaps, and so not the paper's read-out of them.
 
 Hardware   cpu: 2 cores; two shares in two terminals, each with OMP_NUM_THREADS=1, are faster than one run (--share 0/2
            and --share 1/2)
@@ -275,7 +275,7 @@ def score_of(path: Path) -> float:
 
 
 def trials(scale: Scale, spacecraft: list[str]) -> Iterator[tuple[Method, str, int]]:
-    """What is trained, the most telling first."""
+    """What is trained, the most informative first."""
     ablated = [name for name in ABLATED if name in spacecraft]
     others = [name for name in spacecraft if name not in ABLATED]
     parts = (
@@ -300,7 +300,7 @@ def run_training(work: Path, spacecraft: str, out: Path, settings: TrainSettings
 
 
 def learning_curve(run: Path) -> dict[str, object]:
-    """Pictures seen by the whole run, and its validation RMSE in px along the way, from its metrics."""
+    """Pictures of the whole run, and its validation RMSE in px along the way, from its metrics."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     pictures = [int(float(row["samples"])) for row in rows]
@@ -317,7 +317,7 @@ def judge(work: Path, model: Path, method: Method, spacecraft: str, seed: int) -
     runs: dict[str, ProtocolRun] = {run.protocol: run for run in evaluate(dataset, estimator).runs}
     size = estimator.settings.input_size
     if isinstance(estimator, DirectEstimator):
-        network = estimator.network
+        network = OnnxModel(model / "direct.onnx")
     else:
         network = OnnxModel(model / "keypoints.onnx")
         paper = PaperEstimator(network.predict, estimator.spacecraft, size)

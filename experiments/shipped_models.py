@@ -148,7 +148,7 @@ def jobs(work: Path, scale: Scale, start: Path | None, seed: int, kinds: tuple[s
     keypoints: list[Job] = []
     locators: list[Job] = []
     for name, minutes in zip(NAMES, scale.keypoint_minutes, strict=True):
-        init = work / "runs" / FIRST / BEST if start is None else start / name / "keypoints.safetensors"
+        init: Path | None = work / "runs" / FIRST / BEST if start is None else start / name / "keypoints.safetensors"
         settings = run_settings("gknet-s", minutes, 6, seed, init, scale.stages)
         keypoints.append(Job(work, "crops", name, f"{name}_keypoints", settings))
         init = None if start is None else start / name / "locator.safetensors"
@@ -174,7 +174,9 @@ def run_settings(
 
 def check_start(start: Path | None) -> None:
     """Before hours of rendering, not after them."""
-    for name in NAMES if start is not None else ():
+    if start is None:
+        return
+    for name in NAMES:
         for kind in KINDS:
             load_weights(start / name / f"{kind}.safetensors")
 

@@ -23,7 +23,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     annotations = [parameter.annotation for parameter in signature.parameters.values()]
     if signature.return_annotation is Any or not any(map(has_array, [*annotations, signature.return_annotation])):
         return function
-    return beartype(function, conf=CONFIGURATION)
+    return beartype(conf=CONFIGURATION)(function)
 
 
 def has_array(annotation: object) -> bool:
