@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,7 +19,7 @@ from torch import Tensor, nn
 
 from gknet.errors import GknetError
 from gknet.io.atomic import write_bytes
-from gknet.io.text import parse_json, validated
+from gknet.io.text import parse_json, printable, validated
 from gknet.io.torch_file import load_torch_file
 from gknet.network.weight_names import with_current_names
 
@@ -100,6 +102,7 @@ def load_checkpoint(folder: Path, learned: Learned, identity: Mapping[str, str])
     path = folder / CHECKPOINT
     if not path.exists():
         raise GknetError(f"{path}: no checkpoint to resume from; leave out --resume to start anew")
+    _check_sums(path)
     content = load_torch_file(path)
     if not isinstance(content, dict) or not isinstance(content.get("identity"), dict):
         raise GknetError(f"{path}: not a checkpoint of this version of 'gknet train'; train anew in another folder")
@@ -121,6 +124,17 @@ def load_checkpoint(folder: Path, learned: Learned, identity: Mapping[str, str])
         best = weights_metadata(folder / BEST).get("best", state.best)
         state.best = validated(TypeAdapter(dict[str, float] | None), best, folder / BEST)
     return state
+
+
+def _check_sums(path: Path) -> None:
+    """Hold the file against its own checksums, which torch.load passes over."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            damaged = file.testzip()
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+        raise GknetError(f"{path}: not readable as a checkpoint ({error}); train anew in another folder") from error
+    if damaged is not None:
+        raise GknetError(f"{path}: not readable: {printable(damaged)} in it is damaged; train anew in another folder")
 
 
 def _check_identity(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:

@@ -41,12 +41,15 @@ def cpu_has_bf16() -> bool:
     return any(flag in flags for flag in BF16_FLAGS)
 
 
+def _is_on_gpu(settings: TrainSettings) -> bool:
+    return settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
+
+
 def chosen_precision(settings: TrainSettings) -> str:
     """The precision of the settings; for "auto" bfloat16 where the device multiplies it in hardware."""
     if settings.precision != "auto":
         return settings.precision
-    on_gpu = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
-    has_bf16 = torch.cuda.is_bf16_supported() if on_gpu else cpu_has_bf16()
+    has_bf16 = torch.cuda.is_bf16_supported() if _is_on_gpu(settings) else cpu_has_bf16()
     return "bf16-mixed" if has_bf16 else "32-true"
 
 
@@ -57,6 +60,11 @@ def make_fabric(settings: TrainSettings) -> Fabric:
         GknetError: This machine does not have them, or not in that precision.
     """
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # no notes about the precision that was chosen
+    is_there = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+    if settings.device in is_there and not is_there[settings.device]():
+        raise GknetError(f"device: '{settings.device}' is not available on this machine; leave it out")
+    if settings.precision == "16-mixed" and not _is_on_gpu(settings):
+        raise GknetError("precision: 16-mixed needs a GPU; leave it out, or choose bf16-mixed")
     try:
         fabric = Fabric(
             accelerator=settings.device,
