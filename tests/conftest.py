@@ -13,5 +13,7 @@ import tests.checked  # noqa: F401  (the hook finds it by name)
 
 install_import_hook("gknet", "tests.checked.checked")
 
+import gknet.io.openmp  # noqa: E402, F401  (before a test imports torch)
+
 settings.register_profile("gknet", deadline=None, max_examples=50, derandomize=True)
 settings.load_profile("gknet")

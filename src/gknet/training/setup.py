@@ -60,8 +60,8 @@ def make_fabric(settings: TrainSettings) -> Fabric:
         GknetError: This machine does not have them, or not in that precision.
     """
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # no notes about the precision that was chosen
-    is_there = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
-    if settings.device in is_there and not is_there[settings.device]():
+    available = {"auto": True, "cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not available[settings.device]:
         raise GknetError(f"device: '{settings.device}' is not available on this machine; leave it out")
     if settings.precision == "16-mixed" and not _is_on_gpu(settings):
         raise GknetError("precision: 16-mixed needs a GPU; leave it out, or choose bf16-mixed")
