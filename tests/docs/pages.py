@@ -13,6 +13,10 @@ NOT_RUN = re.compile(r"<!-- not run: .+ -->")
 _FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>`{3,})(?P<info>[^`\n]*)$")
 
 
+GENERATED = frozenset({DOCS / "reference" / "commands.md"})
+"""Pages that the build of the site writes."""
+
+
 @dataclass(frozen=True)
 class Block:
     """A fenced block. `run` is False below a comment <!-- not run: why -->."""
@@ -25,10 +29,9 @@ class Block:
 
 def pages() -> list[Path]:
     """Every page of the site, and those that a repository's page shows."""
-    generated = {DOCS / "reference" / "commands.md"}
     fronts = list(ROOT.glob("*.md"))
     cards = ROOT.glob("src/gknet/models/*/README.md")
-    return sorted([*fronts, *cards, *(path for path in DOCS.rglob("*.md") if path not in generated)])
+    return sorted([*fronts, *cards, *(path for path in DOCS.rglob("*.md") if path not in GENERATED)])
 
 
 def name_of(path: Path) -> str:
