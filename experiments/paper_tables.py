@@ -52,6 +52,7 @@ from gknet.inference.onnx_model import OnnxModel
 from gknet.io.atomic import write_text
 from gknet.render.generate import generate
 from gknet.render.options import Options, Selection
+from gknet.render.render_progress import RenderProgress
 from gknet.training.checkpoint import CHECKPOINT
 from gknet.training.export import export_run
 from gknet.training.loop import train
@@ -210,9 +211,10 @@ def render(work: Path, scale: Scale, spacecraft: list[str]) -> None:
             Selection((name,), split, scale.sequences, every)
             for split, every in (("train", scale.crops_every), ("val", scale.val_every), ("test", scale.test_every))
         )
-        generate("skd", work / "crops", crops, train)
-        generate("skd", work / "frames", frames, val)
-        generate("skd", work / "frames", frames, test)
+        with RenderProgress() as progress:
+            generate("skd", work / "crops", crops, train, on_progress=progress.show)
+            generate("skd", work / "frames", frames, val, on_progress=progress.show)
+            generate("skd", work / "frames", frames, test, on_progress=progress.show)
 
 
 def wait_for(path: Path) -> None:

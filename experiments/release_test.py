@@ -29,8 +29,9 @@ from gknet.evaluation.evaluate import Evaluation, evaluate
 from gknet.fleet import NAMES
 from gknet.io.atomic import write_text
 from gknet.io.text import read_json
-from gknet.render.generate import Progress, generate
+from gknet.render.generate import generate
 from gknet.render.options import Options, Selection
+from gknet.render.render_progress import RenderProgress
 
 RECIPE, SEED, SPLIT, EVERY = "skd", 1, "test", 15
 RESULTS = Path(__file__).parents[1] / "results/release_test"
@@ -43,11 +44,8 @@ SHOWN = {"rmse_px": "RMSE px", "e_t": "E_t", "e_q_rad": "E_q rad"}
 
 def render(work: Path) -> None:
     """The frames of all spacecraft; what is there is kept."""
-    generate(RECIPE, work, Options(SEED), Selection(split=SPLIT, every=EVERY), on_progress=print_progress)
-
-
-def print_progress(progress: Progress) -> None:
-    print(f"\r{progress.done} of {progress.total} frames rendered", end="", flush=True)
+    with RenderProgress() as progress:
+        generate(RECIPE, work, Options(SEED), Selection(split=SPLIT, every=EVERY), on_progress=progress.show)
 
 
 def labels(dataset: SkdDataset) -> dict[str, str]:

@@ -38,7 +38,8 @@ from gknet.inference.load import load_estimator
 from gknet.network.build import build
 from gknet.render.generate import generate
 from gknet.render.options import Options, Selection
-from gknet.render.recipe import RECIPES
+from gknet.render.recipe import RECIPES, Recipe
+from gknet.render.render_progress import RenderProgress
 from gknet.report.write import evaluate_section, write_report
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights, save_weights
 from gknet.training.export import export_run
@@ -123,13 +124,18 @@ def render(work: Path, scale: Scale, kinds: tuple[str, ...] = KINDS) -> None:
             Selection((name,), split, every=every)
             for split, every in (("train", scale.crops_every), ("val", scale.val_every), ("test", scale.test_every))
         )
-        generate(longer, work / "crops", Options(DATA_SEED, "target"), train)
+        render_part(longer, work / "crops", Options(DATA_SEED, "target"), train)
         if "locator" in kinds:
             few = replace(train, every=scale.pictures_every)
-            generate(longer, work / "pictures", Options(DATA_SEED, size=256), few)
-        generate("skd", work / "frames", Options(DATA_SEED), val)
-        generate("skd", work / "frames", Options(DATA_SEED), test)
-        generate("skd-hard", work / "hard", Options(DATA_SEED), test)
+            render_part(longer, work / "pictures", Options(DATA_SEED, size=256), few)
+        render_part("skd", work / "frames", Options(DATA_SEED), val)
+        render_part("skd", work / "frames", Options(DATA_SEED), test)
+        render_part("skd-hard", work / "hard", Options(DATA_SEED), test)
+
+
+def render_part(recipe: str | Recipe, out: Path, options: Options, selection: Selection) -> None:
+    with RenderProgress() as progress:
+        generate(recipe, out, options, selection, on_progress=progress.show)
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ def render(
     workers: Annotated[int, typer.Option(help="Processes; 1 renders in this one with all cores.")] = 2,
 ) -> None:
     """Render a dataset in the SKD layout, with poses, keypoint visibility and a contact sheet."""
-    from gknet.cli.render_progress import RenderProgress
     from gknet.errors import GknetError
     from gknet.render.generate import generate
+    from gknet.render.render_progress import RenderProgress
 
     with RenderProgress() as progress:
         result = generate(recipe, out, options, selection, workers, on_progress=progress.show)

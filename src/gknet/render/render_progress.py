@@ -1,4 +1,4 @@
-"""The progress of `gknet render`: a bar with the time left on a terminal, a line now and then in a log file."""
+"""The progress of rendering for people: a bar with the time left on a terminal, a line now and then in a log file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ REASONS_SHOWN = 10
 
 
 class RenderProgress:
-    """A context whose `show` is given the progress of a rendering job. It writes to standard error."""
+    """Writes the progress of rendering jobs, one after the other, to standard error.
+
+    with RenderProgress() as progress:
+        generate("skd", "out", on_progress=progress.show)
+    """
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
@@ -43,10 +47,12 @@ class RenderProgress:
 
     def show(self, progress: Progress) -> None:
         """Update the bar; in a log file, write a line every `LOG_EVERY_S` and one at the end."""
+        gone = progress.done + len(progress.failures)
+        if gone == 0:
+            self._logged_s, self._shown = 0.0, 0
         for reason in progress.failures[self._shown : REASONS_SHOWN]:
             self._print(f"frame failed: {printable(reason)}")
         self._shown = len(progress.failures)
-        gone = progress.done + len(progress.failures)
         pace = progress.seconds / max(gone, 1)
         self._bar.update(self._task, total=progress.total, completed=gone, rate=f"{pace:.3f} s/frame")
         is_due = gone == progress.total or progress.seconds - self._logged_s > LOG_EVERY_S
