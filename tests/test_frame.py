@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gknet.errors import GknetError
-from gknet.frame import Box, Estimate, Failure, FailureKind, Frame
+from gknet.frame import Box, Estimate, Failure, FailureKind, Frame, Unreadable
 from gknet.geometry import Camera, Pose
 from tests.strategies import boxes
 
@@ -110,10 +112,22 @@ def test_estimate_is_a_pose_or_a_reason() -> None:
         Estimate(cam_from_body=Pose.identity(), failure=Failure(FailureKind.NO_CONSENSUS, "dark"))
 
 
-def test_a_pose_is_doubted_when_more_is_believed_of_other_attitudes() -> None:
+def test_a_pose_is_ambiguous_when_other_attitudes_are_more_probable() -> None:
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 5.0]))
-    doubted = [
-        Estimate(cam_from_body=pose, attitude_confidence=belief).is_ambiguous for belief in (None, 0.0, 0.49, 0.5, 1.0)
+    ambiguous = [
+        Estimate(cam_from_body=pose, attitude_confidence=confidence).is_ambiguous
+        for confidence in (None, 0.0, 0.49, 0.5, 1.0)
     ]
-    assert doubted == [False, True, True, False, False]
+    assert ambiguous == [False, True, True, False, False]
     assert not Estimate(failure=Failure(FailureKind.NO_CONSENSUS, "dark")).is_ambiguous
+
+
+def test_a_failure_is_a_word_for_programs_and_a_line_for_people() -> None:
+    failure = Failure(FailureKind.TOO_FEW_INLIERS, "only 3 of 11 keypoints agree")
+    assert str(failure) == failure.detail
+    assert failure.to_dict() == {"kind": "too_few_inliers", "detail": failure.detail}
+    assert failure.kind == "too_few_inliers"
+    assert failure.kind.label == "too few inliers"
+    assert json.loads(json.dumps({failure.kind: failure.kind})) == {"too_few_inliers": "too_few_inliers"}
+    unreadable = Unreadable.because("a.jpg", GknetError("a.jpg: truncated"))
+    assert unreadable.failure == Failure(FailureKind.UNREADABLE_IMAGE, "a.jpg: truncated")

@@ -1,4 +1,4 @@
-"""A calibration finds how large the errors are, whatever the network believed, and is not fooled by swaps."""
+"""A calibration finds how large the errors are, whatever the network estimated, and swaps do not mislead it."""
 
 from __future__ import annotations
 

@@ -64,9 +64,9 @@ def test_where_attitudes_hold_both_are_judged_on_the_frames_that_both_know() -> 
         return replace(trial(method, rmse), values={"rmse_px": rmse, "e_q_rad": e_q})
 
     rmse, right = np.arange(30.0), np.full(30, 0.1)
-    twin, other = right.copy(), right.copy()
-    twin[:10], other[5:12] = 3.1, 0.36
-    pair = [known("a", rmse, twin)], [known("b", 2 * rmse, other)]
+    counterpart, other = right.copy(), right.copy()
+    counterpart[:10], other[5:12] = 3.1, 0.36
+    pair = [known("a", rmse, counterpart)], [known("b", 2 * rmse, other)]
     ours, theirs = where_attitudes_hold(*pair)
     for (masked,), factor in ((ours, 1), (theirs, 2)):
         assert np.isnan(masked.values["rmse_px"][:12]).all()

@@ -1,4 +1,4 @@
-"""The paper's read-out does what the paper says, no better: whole cells, all keypoints, no doubt."""
+"""The paper's read-out is as the paper states it: whole cells, all keypoints, no covariance."""
 
 from __future__ import annotations
 

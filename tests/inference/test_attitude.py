@@ -56,19 +56,19 @@ def test_a_label_is_a_gaussian_of_the_angle_over_the_volume_of_rotations() -> No
         assert (np.abs(spread / (0.6 * 2 * np.pi / 16) - 1) < 0.25).all()
 
 
-def test_of_two_twins_half_a_turn_apart_the_likelier_is_taken_whole() -> None:
+def test_of_two_counterparts_half_a_turn_apart_the_likelier_is_the_mean() -> None:
     one = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], np.zeros(3))
-    twin = one @ HALF_TURN
-    belief = 0.6 * BINS.soft_label(one.quaternion_wxyz) + 0.4 * BINS.soft_label(twin.quaternion_wxyz)
-    assert Pose.from_quaternion(BINS.attitude_wxyz(belief), np.zeros(3)).angle_to(one) < math.radians(2)
+    counterpart = one @ HALF_TURN
+    probability = 0.6 * BINS.soft_label(one.quaternion_wxyz) + 0.4 * BINS.soft_label(counterpart.quaternion_wxyz)
+    assert Pose.from_quaternion(BINS.attitude_wxyz(probability), np.zeros(3)).angle_to(one) < math.radians(2)
 
 
 def test_probability_near_an_attitude() -> None:
     one = Pose.from_quaternion([0.3, -0.5, 0.7, 0.4], np.zeros(3)).quaternion_wxyz
-    twin = (Pose.from_quaternion(one, np.zeros(3)) @ HALF_TURN).quaternion_wxyz
-    belief = 0.6 * BINS.soft_label(one) + 0.4 * BINS.soft_label(twin)
-    for attitude, share in ((one, 0.6), (-one, 0.6), (twin, 0.4)):
-        assert BINS.probability_near(belief, attitude, math.radians(60)) == pytest.approx(share, abs=0.01)
+    counterpart = (Pose.from_quaternion(one, np.zeros(3)) @ HALF_TURN).quaternion_wxyz
+    probability = 0.6 * BINS.soft_label(one) + 0.4 * BINS.soft_label(counterpart)
+    for attitude, share in ((one, 0.6), (-one, 0.6), (counterpart, 0.4)):
+        assert BINS.probability_near(probability, attitude, math.radians(60)) == pytest.approx(share, abs=0.01)
     everything = np.full(BINS.count, 1 / BINS.count)
     assert BINS.probability_near(everything, one, math.pi) == pytest.approx(1)
     assert BINS.probability_near(everything, one, math.radians(60)) < 0.15

@@ -70,7 +70,7 @@ def test_a_few_bad_cells_do_not_hide_a_peak() -> None:
 
 
 def test_covariance_of_a_spread_heatmap_follows_the_spread() -> None:
-    """A heatmap averaged over possible places tells how far apart they are, and along which axis."""
+    """A heatmap averaged over possible positions shows how far apart they are, and along which axis."""
     generator = np.random.default_rng(4)
     spread = np.array([[1.2, 0.5], [0.5, 0.5]])
     places = generator.multivariate_normal((32.3, 30.7), spread, 3000)

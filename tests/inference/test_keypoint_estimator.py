@@ -32,7 +32,7 @@ CAMERA = Camera.from_focal(1000, 800, 640)
 
 
 class Chart:
-    """A picture whose red and green say where each pixel is, and whose blue says that it is in the picture.
+    """A picture whose red and green encode where each pixel is, and whose blue marks the picture itself.
 
     Red and green rise from 0 to 1 over the square from `low` to `low + span`, dithered so that they err nowhere.
     """

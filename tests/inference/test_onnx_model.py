@@ -59,7 +59,7 @@ def test_runs_and_knows_its_spacecraft(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metadata", "said"),
+    ("metadata", "words"),
     [
         (None, "metadata"),
         ("{", "JSON"),
@@ -77,8 +77,8 @@ def test_runs_and_knows_its_spacecraft(tmp_path: Path) -> None:
         (json.dumps({k: v for k, v in METADATA.items() if k != "spacecraft"}), "spacecraft"),
     ],
 )
-def test_foreign_metadata_is_refused(tmp_path: Path, metadata: str | None, said: str) -> None:
-    with pytest.raises(GknetError, match=said):
+def test_foreign_metadata_is_refused(tmp_path: Path, metadata: str | None, words: str) -> None:
+    with pytest.raises(GknetError, match=words):
         OnnxModel(write_pool(tmp_path / "k.onnx", metadata))
 
 

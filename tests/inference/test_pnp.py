@@ -1,4 +1,4 @@
-"""The pose solver: exact on the truth, robust, honest about its covariance, and able to say no."""
+"""The pose solver: exact on the truth, robust, with a covariance that fits its errors, and failures with a kind."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_covariance_matches_the_scatter() -> None:
 
 
 def test_a_sure_keypoint_counts_more() -> None:
-    """The one keypoint that is off moves the pose less when it says that it is unsure."""
+    """The one keypoint that is off moves the pose less when its covariance is large."""
     keypoints = detections(POSE)
     pixels = keypoints.pixels.copy()
     pixels[3] += (4, 0)
