@@ -1,4 +1,4 @@
-"""The cache keeps what the frames say; identity k stays row k; item i never depends on the order."""
+"""The cache keeps the frames' labels; keypoint k stays row k; item i never depends on the order."""
 
 from __future__ import annotations
 
@@ -96,11 +96,11 @@ class Frames:
 
 def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: Path) -> None:
     frames = Frames([a_frame((0.2 * k, 0, 12), 128) for k in range(5)], bad=1)
-    said: list[str] = []
+    reports: list[str] = []
     place = tmp_path / "cache"
-    cache = build_cache(frames, CRAFT, place, 64, report=said.append)
+    cache = build_cache(frames, CRAFT, place, 64, report=reports.append)
     assert len(cache) == 4
-    assert said == ["left out: frame 1: truncated"]
+    assert reports == ["left out: frame 1: truncated"]
     again = build_cache(frames, CRAFT, place, 64)
     assert frames.reads == 5
     np.testing.assert_array_equal(again.images, cache.images)
@@ -243,8 +243,8 @@ def test_boxes_are_corners_in_order_inside_the_input(folder: Path) -> None:
     assert ((low >= 0) & (high <= 64) & (high > low)).all()
 
 
-def test_some_of_the_seen_points_of_some_pictures_are_told() -> None:
-    """In half of the pictures, up to .6 of the points that are seen, 15 % of all; one out of view never."""
+def test_some_of_the_points_in_view_of_some_samples_are_prompted() -> None:
+    """In half of the samples, up to .6 of the points in view, 15 % of all; one out of view never."""
     count, points = 400, 10
     generator = np.random.default_rng(1)
     cache = Cache(
@@ -255,9 +255,9 @@ def test_some_of_the_seen_points_of_some_pictures_are_told() -> None:
         np.full((1, 7), np.nan, np.float32),
     )
     samples = [draw_keypoints(np.random.default_rng(i), cache, 0, 64) for i in range(count)]
-    told = np.stack([sample.told for sample in samples])
-    assert not told[np.stack([sample.weight for sample in samples]) == 0].any()
-    assert not told[:, 3].any()
-    assert 0.35 < told.any(axis=1).mean() < 0.55
-    assert 0.12 < told[:, :3].mean() < 0.18
-    assert told.sum(axis=1).max() <= 9
+    prompted = np.stack([sample.prompted for sample in samples])
+    assert not prompted[np.stack([sample.weight for sample in samples]) == 0].any()
+    assert not prompted[:, 3].any()
+    assert 0.35 < prompted.any(axis=1).mean() < 0.55
+    assert 0.12 < prompted[:, :3].mean() < 0.18
+    assert prompted.sum(axis=1).max() <= 9

@@ -59,7 +59,7 @@ def straight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def result(out: Path) -> dict[str, Any]:
-    """All of a run that does not tell the time."""
+    """All of a run but its times."""
     content = torch.load(out / CHECKPOINT, weights_only=True)
     state = {name: value for name, value in content["state"].items() if name != "elapsed_s"}
     state["history"] = [

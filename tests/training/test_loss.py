@@ -85,9 +85,9 @@ def test_the_likelihood_loss_is_zero_on_the_truth_and_blind_to_masked_keypoints(
     maps = targets.clamp(min=1e-30).log() / SHARPNESS
     weight = torch.ones(2, 5)
     assert likelihood_loss(maps, targets, weight).item() == pytest.approx(0, abs=1e-5)
-    assert likelihood_loss(maps + 3, targets, weight).item() == pytest.approx(0, abs=1e-5)  # a constant is no belief
-    twins = torch.logaddexp(maps * SHARPNESS, maps.flip(3) * SHARPNESS) / SHARPNESS
-    assert likelihood_loss(twins, targets, weight).item() == pytest.approx(np.log(2), rel=0.2)
+    assert likelihood_loss(maps + 3, targets, weight).item() == pytest.approx(0, abs=1e-5)  # no change of probability
+    counterparts = torch.logaddexp(maps * SHARPNESS, maps.flip(3) * SHARPNESS) / SHARPNESS
+    assert likelihood_loss(counterparts, targets, weight).item() == pytest.approx(np.log(2), rel=0.2)
     maps[0, 3] = torch.rand(32, 32)
     assert likelihood_loss(maps, targets, weight) > 0.1
     weight[0, 3] = 0

@@ -58,7 +58,7 @@ def test_a_two_pass_network_receives_the_truth_of_prompted_keypoints() -> None:
     assert KeypointTask(toy_spacecraft(), 64, 0.2).loss(network, BATCH, CPU) == 0
     (prompts,) = network.prompts
     assert torch.equal(prompts.maps, TRUTH)
-    assert torch.equal(prompts.prompted, BATCH.told)
+    assert torch.equal(prompts.prompted, BATCH.prompted)
 
 
 def test_prompted_keypoints_count_in_the_first_pass_alone() -> None:

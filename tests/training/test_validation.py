@@ -23,7 +23,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> SkdDataset:
 
 
 class Middle(torch.nn.Module):
-    """A locator that always says the middle half of the picture."""
+    """A locator that always finds the middle half of the image."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         output = torch.full((len(images), 5, 16, 16), 0.25)

@@ -2,8 +2,7 @@
 
 libgomp's threads spin 300,000 times, some 10 ms, before they sleep. Beside other busy processes the spinning keeps the
 very thread from running that it waits for: a training becomes many times slower. Sleeping at once, by the environment
-variable OMP_WAIT_POLICY=PASSIVE,
-costs a quiet machine 20 to 40 %, so a short spin is kept.
+variable OMP_WAIT_POLICY=PASSIVE, costs a quiet machine 20 to 40 %, so a short spin is kept.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One 3x3 matrix warps picture, points and K together; then the light and the sensor change. Numpy and OpenCV."""
+"""Augmentation: one 3x3 matrix warps image, points and K together, then exposure and sensor change."""
 
 from __future__ import annotations
 
@@ -16,15 +16,23 @@ from numpy import ndarray
 class Augmentation:
     """Ranges of the random changes.
 
-    margin       the input's side over the keypoints' box (deployed: 1.25 about the detected box)
-    shift        of the box's centre, as a share of the box's side, each axis
-    turn         rotate in the picture's plane by any angle
-    probability  of each photometric change that is not always there
+    Attributes:
+        margin: The input's side over the keypoints' box (deployed: 1.25 around the detected box).
+        shift: Of the box's centre on each axis, as a share of the box's side.
+        rotate: Whether the image is rotated in its plane, by any angle.
+        gamma: Largest logarithm of the exponent.
+        gain: Factor of the brightness.
+        offset: Largest change of the brightness, of 255.
+        colour: Largest change of a channel's factor.
+        noise: Standard deviation, of 255.
+        blur: Standard deviation in pixels.
+        probability: Of each photometric change that does not always happen.
+        occlusion: Probability of a rectangle in front of the spacecraft.
     """
 
     margin: tuple[float, float] = (1.05, 1.55)
     shift: float = 0.08
-    turn: bool = True
+    rotate: bool = True
     gamma: float = 0.35
     gain: tuple[float, float] = (0.6, 1.6)
     offset: float = 8.0
@@ -37,7 +45,12 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class PictureAugmentation:
-    """Ranges for whole pictures (the locator): quarter turns, zoom and shift (share of the picture's side)."""
+    """Ranges for whole images (the locator), which are also rotated by quarter turns.
+
+    Attributes:
+        zoom: Factor of the size.
+        shift: On each axis, as a share of the image's side.
+    """
 
     zoom: tuple[float, float] = (0.75, 1.4)
     shift: float = 0.15
@@ -52,7 +65,7 @@ def scaling(s: float) -> Float[ndarray, "3 3"]:
 
 
 def rotation(angle_rad: float) -> Float[ndarray, "3 3"]:
-    """Turns x towards y: clockwise on the screen."""
+    """Rotation from x towards y: clockwise on the screen."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
@@ -63,7 +76,7 @@ def warp_points(matrix: Float[ndarray, "3 3"], points: Float[ndarray, "*n 2"]) -
 
 
 def warp_image(image: UInt8[ndarray, "h w 3"], matrix: Float[ndarray, "3 3"], size: int) -> UInt8[ndarray, "s s 3"]:
-    """The picture under input_from_image, black outside; averaged first when it shrinks a lot."""
+    """The image under input_from_image, black outside; averaged first when it shrinks a lot."""
     shrink = math.sqrt(abs(np.linalg.det(matrix[:2, :2])))
     while shrink < 0.6 and min(image.shape[:2]) >= 2:
         height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
@@ -82,21 +95,21 @@ def craft_warp(
     size: int,
     ranges: Augmentation,
 ) -> Float[ndarray, "3 3"]:
-    """input_from_cache: any turn, then a crop as a jittered detection would make it."""
-    turn = rotation(rng.uniform(-math.pi, math.pi) if ranges.turn else 0.0)
-    turned = warp_points(turn, points[in_view])
-    low, high = turned.min(axis=0), turned.max(axis=0)
+    """input_from_cache: any rotation, then a crop as a jittered detection would make it."""
+    rotated_from_cache = rotation(rng.uniform(-math.pi, math.pi) if ranges.rotate else 0.0)
+    rotated = warp_points(rotated_from_cache, points[in_view])
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
     side = max(8.0, float((high - low).max()))
     centre = (low + high) / 2 + rng.uniform(-ranges.shift, ranges.shift, 2) * side
     margin = math.exp(rng.uniform(*np.log(ranges.margin)))
     scale = size / (side * margin)
-    return translation(size / 2, size / 2) @ scaling(scale) @ translation(-centre[0], -centre[1]) @ turn
+    return translation(size / 2, size / 2) @ scaling(scale) @ translation(-centre[0], -centre[1]) @ rotated_from_cache
 
 
 def picture_warp(
     rng: np.random.Generator, cache_size: int, size: int, ranges: PictureAugmentation
 ) -> Float[ndarray, "3 3"]:
-    """input_from_cache: a quarter turn about the centre, zoom and shift."""
+    """input_from_cache: a rotation by quarter turns about the centre, zoom and shift."""
     half = cache_size / 2
     scale = size / cache_size * math.exp(rng.uniform(*np.log(ranges.zoom)))
     shift = size / 2 + rng.uniform(-ranges.shift, ranges.shift, 2) * size
@@ -106,7 +119,7 @@ def picture_warp(
 
 @lru_cache(maxsize=32)
 def _noise_pool(quarters: int) -> ndarray:
-    """Noise of sigma quarters / 4, made once: drawing it anew would cost more than the warp."""
+    """Noise of standard deviation quarters / 4, made once: drawing it anew would cost more than the warp."""
     values = np.random.default_rng(quarters).normal(0, quarters / 4, 1 << 20)
     return np.clip(np.rint(values), -127, 127).astype(np.int8)
 
@@ -146,7 +159,7 @@ def _occlude(rng: np.random.Generator, image: UInt8[ndarray, "s s 3"]) -> None:
 def photometric(
     rng: np.random.Generator, image: UInt8[ndarray, "s s 3"], ranges: Augmentation
 ) -> UInt8[ndarray, "s s 3"]:
-    """Another exposure, another sensor: the geometry stays."""
+    """Another exposure and another sensor; the geometry stays."""
     if rng.random() < ranges.probability:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(*ranges.blur))
     if rng.random() < 2 * ranges.probability:

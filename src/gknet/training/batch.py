@@ -1,4 +1,4 @@
-"""The only door from numpy to torch: cached crops become augmented batches, made by a thread ahead of the loop."""
+"""Cached crops become augmented batches of tensors, made by a thread ahead of the loop. Numpy ends here."""
 
 from __future__ import annotations
 
@@ -30,37 +30,46 @@ from gknet.training.schedule import Stage
 AHEAD = 3
 """Batches prepared ahead of the loop."""
 
-TOLD_OF, MOST_TOLD = 0.5, 0.6
-"""Share of the pictures with prompts, and the largest share of such a picture's keypoints that are told."""
+PROMPTED_SAMPLES, PROMPTED_KEYPOINTS = 0.5, 0.6
+"""Share of the samples with teacher-forced keypoints, and the largest share of such a sample's keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A network's input and what is to be found in it: points in input pixels, and the pose.
+    """A network's input and its labels.
 
-    image (s, s, 3) uint8; points_px (k, 2); weight (k,) 1 where the point counts, 0 where it is out of view
-    told (k,) whether a network that looks twice is told the point before it looks again
-    pose (7,) as the input shows it, `CropPose.vector`; NaN where it has none to show
+    Attributes:
+        image: (s, s, 3) RGB.
+        points_px: (k, 2) in pixels of the input; 0 where out of view.
+        weight: (k,) 1 where the point counts, 0 where it is out of view.
+        prompted: (k,) whether a two-pass network receives the point before its second pass (teacher forcing).
+        pose: (7,) relative to the crop, `CropPose.vector`; NaN where there is none.
     """
 
     image: UInt8[ndarray, "s s 3"]
     points_px: Float[ndarray, "k 2"]
     weight: Float[ndarray, " k"]
-    told: Bool[ndarray, " k"]
+    prompted: Bool[ndarray, " k"]
     pose: Float[ndarray, "7"]
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Samples stacked. `position` counts the samples of all processes up to the end of this batch.
+    """Samples stacked.
 
-    image is (b, s, s, 3) uint8, so that its permuted view is channels_last.
+    Attributes:
+        image: (b, s, s, 3) RGB; its permuted view is channels_last.
+        points_px: (b, k, 2), see `Sample`.
+        weight: (b, k), see `Sample`.
+        prompted: (b, k), see `Sample`.
+        pose: (b, 7), see `Sample`.
+        position: Samples of all processes up to the end of this batch.
     """
 
     image: UInt8[Tensor, "b s s 3"]
     points_px: Float[Tensor, "b k 2"]
     weight: Float[Tensor, "b k"]
-    told: Bool[Tensor, "b k"]
+    prompted: Bool[Tensor, "b k"]
     pose: Float[Tensor, "b 7"]
     position: int
 
@@ -77,30 +86,30 @@ Draw = Callable[[np.random.Generator, Cache, int, int], Sample]
 
 
 def draw_keypoints(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
-    """A crop about the craft; row k of the points is keypoint k, whatever is out of view."""
+    """A crop around the spacecraft; row k of the points is keypoint k, whatever is out of view."""
     ranges = Augmentation()
     points, in_view = cache.points_px[row].astype(np.float64), cache.in_view[row]
     matrix = craft_warp(rng, points, in_view, size, ranges)
     image = photometric(rng, warp_image(cache.images[row], matrix, size), ranges)
     warped = warp_points(matrix, points)
-    seen = in_view & points_inside(warped, size)
-    points_px = np.where(seen[:, None], warped, 0.0).astype(np.float32)
-    told = seen & (rng.random(len(points)) < _share_told(rng))
-    return Sample(image, points_px, seen.astype(np.float32), told, _warped_pose(cache, row, matrix, size))
+    valid = in_view & points_inside(warped, size)
+    points_px = np.where(valid[:, None], warped, 0.0).astype(np.float32)
+    prompted = valid & (rng.random(len(points)) < _prompted_share(rng))
+    return Sample(image, points_px, valid.astype(np.float32), prompted, _warped_pose(cache, row, matrix, size))
 
 
-def _share_told(rng: np.random.Generator) -> float:
-    return rng.uniform(0, MOST_TOLD) if rng.random() < TOLD_OF else 0.0
+def _prompted_share(rng: np.random.Generator) -> float:
+    return rng.uniform(0, PROMPTED_KEYPOINTS) if rng.random() < PROMPTED_SAMPLES else 0.0
 
 
 def draw_box(rng: np.random.Generator, cache: Cache, row: int, size: int) -> Sample:
-    """A whole picture; the two points are the corners of the craft's box, clipped to the input."""
+    """A whole image; the two points are the corners of the spacecraft's box, clipped to the input."""
     matrix = picture_warp(rng, cache.size, size, PictureAugmentation())
     image = photometric(rng, warp_image(cache.images[row], matrix, size), Augmentation())
     corners = warp_points(matrix, cache.boxes_px[row].astype(np.float64).reshape(2, 2)).clip(0, size)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    seen = float((high - low).min() > size / 64)
-    points_px, weight = np.stack([low, high]).astype(np.float32), np.full(2, seen, dtype=np.float32)
+    is_valid = float((high - low).min() > size / 64)
+    points_px, weight = np.stack([low, high]).astype(np.float32), np.full(2, is_valid, dtype=np.float32)
     return Sample(image, points_px, weight, np.zeros(2, dtype=bool), _warped_pose(cache, row, matrix, size))
 
 
@@ -112,12 +121,21 @@ def _warped_pose(cache: Cache, row: int, matrix: Float[ndarray, "3 3"], size: in
 
 
 def points_inside(points: Float[ndarray, "n 2"], size: int) -> Bool[ndarray, " n"]:
+    """Which points lie in a square image."""
     return np.all((points >= 0) & (points <= size), axis=1)
 
 
 @dataclass(frozen=True)
 class Loader:
-    """Batches without end, from any position: sample i of epoch e is a function of (seed, e, i) alone."""
+    """Batches without end, from any position: sample i of epoch e is a function of (seed, e, i) alone.
+
+    Attributes:
+        cache: Of the training data.
+        draw: Makes a sample from a row of the cache.
+        seed: Of the order and the augmentation.
+        rank: Of this process.
+        world: How many processes there are.
+    """
 
     cache: Cache
     draw: Draw
@@ -139,13 +157,18 @@ class Loader:
             torch.from_numpy(np.stack([sample.image for sample in samples])),
             torch.from_numpy(np.stack([sample.points_px for sample in samples])),
             torch.from_numpy(np.stack([sample.weight for sample in samples])),
-            torch.from_numpy(np.stack([sample.told for sample in samples])),
+            torch.from_numpy(np.stack([sample.prompted for sample in samples])),
             torch.from_numpy(np.stack([sample.pose for sample in samples])),
             position + stage.batch * self.world,
         )
 
     def batches(self, position: int, stage_at: Callable[[int], Stage]) -> Generator[Batch, None, None]:
-        """Batches from `position` on; `stage_at(position)` says how large the next one is. Close it when done."""
+        """Batches from a position on, prepared by a thread. Close the generator when done.
+
+        Args:
+            position: Of the first sample.
+            stage_at: Position -> the stage of the batch that begins there.
+        """
         ready: queue.Queue[Batch | BaseException] = queue.Queue(AHEAD)
         stop = threading.Event()
 

@@ -1,4 +1,4 @@
-"""Decoded crops of a dataset in one memory-mapped file, so that the CPU trains and does not decode."""
+"""Decoded crops of a dataset in one memory-mapped file, so that a training does not decode."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from gknet.spacecraft import Spacecraft
 logger = logging.getLogger(__name__)
 
 CACHE_MARGIN = 1.6
-"""A cached crop's side over the longer side of the keypoints' box: room to turn and to shift."""
+"""A cached crop's side over the longer side of the keypoints' box: room to rotate and to shift."""
 
 WHOLE = 0.8
-"""A crop that would cover this share of the picture's side takes the whole picture instead."""
+"""A crop that would cover this share of the image's side becomes the whole image."""
 
 LAYOUT = 3
 """Of the files; a cache of another one is built anew."""
@@ -44,7 +44,7 @@ Window = Literal["craft", "picture"]
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A dataset whose labels can be read without its pictures."""
+    """A dataset whose labels can be read without its images."""
 
     def __len__(self) -> int: ...
     def frame(self, i: int, image: bool = True) -> Frame: ...
@@ -57,10 +57,10 @@ class Cache:
     Attributes:
         images: (m, s, s, 3) uint8 RGB, memory-mapped.
         points_px: (m, n, 2) the projected keypoints; NaN behind the camera.
-        in_view: (m, n) whether the keypoint is inside the picture and inside the crop, hidden or not.
-        boxes_px: (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the picture.
-        poses: (m, 7) the true pose as the crop shows it, `CropPose.vector`; NaN where the origin is behind the camera
-            or pixels are not square, since a rotated picture is of no pose then.
+        in_view: (m, n) whether the keypoint is inside the image and inside the crop, hidden or not.
+        boxes_px: (m, 4) the true box x0, y0, x1, y1: the keypoints' box, clipped to the image.
+        poses: (m, 7) the true pose relative to the crop, `CropPose.vector`; NaN where the origin is behind the camera
+            or pixels are not square, since a rotated image has no pose then.
     """
 
     images: UInt8[ndarray, "m s s 3"]
@@ -79,14 +79,14 @@ class Cache:
 
 
 def whole_picture(frame: Frame, size: int) -> Crop:
-    """The smallest centred square around the picture."""
+    """The smallest centred square around the image."""
     width, height = frame.camera.width, frame.camera.height
     side = max(width, height)
     return Crop(-((side - width) // 2), -((side - height) // 2), side, size)
 
 
 def craft_window(frame: Frame, box: Box, size: int) -> Crop:
-    """The square around the craft, or the whole picture when that is hardly more."""
+    """The square around the spacecraft, or the whole image when that is hardly more."""
     whole = whole_picture(frame, size)
     around = Crop.around(box, size, CACHE_MARGIN)
     return whole if around.side >= WHOLE * whole.side else around
@@ -120,7 +120,7 @@ class _Row:
 
 
 def cached_row(frame: Frame, spacecraft: Spacecraft, window: Window, size: int) -> _Row | None:
-    """One frame as the cache keeps it; None when nothing of the craft is in the picture."""
+    """One frame as the cache keeps it; None when nothing of the spacecraft is in the image."""
     assert frame.image is not None
     points_m = spacecraft.points_m
     pixels = frame.keypoints_px(points_m)
@@ -158,7 +158,7 @@ def build_cache(
         place: The folder of this cache alone. What else it holds is removed when the cache is built.
         size: Side of the crops in pixels.
         window: "craft" or "picture".
-        stamp: Stands for the pictures' content, such as sizes and times of the files.
+        stamp: Stands for the images' content, such as sizes and times of the files.
         workers: Threads.
         advance: Called with (done, total) while the cache is built.
         report: Called with a line for each frame that is left out.
@@ -239,7 +239,7 @@ def _rows(
     advance: Callable[[int, int], None],
     report: Callable[[str], None],
 ) -> Iterator[_Row]:
-    """The rows of all frames that show the craft, in order and bounded in memory."""
+    """The rows of all frames that show the spacecraft, in order and bounded in memory."""
 
     def row(i: int) -> _Row | str | None:
         try:
@@ -271,6 +271,6 @@ def _labels(rows: Sequence[tuple[ndarray, ...]]) -> bytes:
 
 
 def _sync(file: BinaryIO) -> None:
-    """On the disk before the header says so: a crash of the machine must not leave a cache of zeros."""
+    """Wait until the content is on the disk: a crash of the machine must not leave a cache of zeros."""
     file.flush()
     os.fsync(file.fileno())

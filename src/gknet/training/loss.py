@@ -18,13 +18,21 @@ SMOOTH = 0.02
 """Where the smooth L1 of offset (sides of the crop) and log_depth turns from square to linear."""
 
 CENTRE_WEIGHT = 0.1
-"""Of the centre's map in the locator's loss. Its cross-entropy, summed over the cells, would drown the box's part."""
+"""Of the centre's map in the locator's loss: its cross-entropy, summed over the cells, would outweigh the box."""
 
 
 def gaussian_targets(
     points_px: Float[Tensor, "b n 2"], stride: int, height: int, width: int, sigma_cells: float
 ) -> Float[Tensor, "b n height width"]:
-    """Gaussians of peak 1 about sub-pixel centres; cell (i, j) is centred at stride * (j + 0.5, i + 0.5) input px."""
+    """Gaussians of peak 1 around sub-pixel centres; cell (i, j) is centred at stride * (j + 0.5, i + 0.5) px.
+
+    Args:
+        points_px: (b, n, 2) in pixels of the input.
+        stride: Input pixels per cell.
+        height: Of the maps, in cells.
+        width: Of the maps, in cells.
+        sigma_cells: Standard deviation.
+    """
     x = (torch.arange(width, device=points_px.device) + 0.5) * stride
     y = (torch.arange(height, device=points_px.device) + 0.5) * stride
     scale = 1 / (2 * (sigma_cells * stride) ** 2)
@@ -38,7 +46,12 @@ def heatmap_loss(
 ) -> Float[Tensor, ""]:
     """Squared error summed over the map and averaged over the keypoints in view: eq. 4 times W H.
 
-    The sum makes the loss about the energy of a Gaussian, whatever the resolution, so one learning rate fits all.
+    The sum is about the energy of a Gaussian at any resolution, so that one learning rate fits all.
+
+    Args:
+        heatmaps: (b, n, h, w).
+        targets: (b, n, h, w) of `gaussian_targets`.
+        weight: (b, n) 1 where the keypoint counts, else 0.
     """
     error = (heatmaps.float() - targets).square().sum(dim=(2, 3))
     return (error * weight).sum() / weight.sum().clamp(min=1)
@@ -47,23 +60,37 @@ def heatmap_loss(
 def likelihood_loss(
     maps: Float[Tensor, "b n h w"], targets: Float[Tensor, "b n h w"], weight: Float[Tensor, "b n"]
 ) -> Float[Tensor, ""]:
-    """Divergence of the believed cells from the target Gaussian, averaged over the keypoints in view.
+    """Kullback-Leibler divergence of each map's distribution over its cells from the target Gaussian.
 
-    0 at best. Unlike the squared error it is not nearly flat about maps without any peak, and it charges a belief
-    for what it excludes.
+    0 at best. Its gradient does not vanish on maps without a peak, as that of the squared error nearly does, and it
+    punishes a distribution that excludes the true cell.
+
+    Args:
+        maps: (b, n, h, w), see `gknet.network.heatmap.log_probability`.
+        targets: (b, n, h, w) of `gaussian_targets`.
+        weight: (b, n) 1 where the keypoint counts, else 0.
+
+    Returns:
+        The mean over the keypoints that count.
     """
-    wanted = targets.flatten(2)
-    wanted = wanted / wanted.sum(dim=2, keepdim=True).clamp(min=TINY)
-    divergence = (wanted * (wanted.clamp(min=TINY).log() - log_probability(maps))).sum(dim=2)
+    target = targets.flatten(2)
+    target = target / target.sum(dim=2, keepdim=True).clamp(min=TINY)
+    divergence = (target * (target.clamp(min=TINY).log() - log_probability(maps))).sum(dim=2)
     return (divergence * weight).sum() / weight.sum().clamp(min=1)
 
 
 def attitude_loss(
     attitude: Float[Tensor, "b k"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
 ) -> Float[Tensor, ""]:
-    """Divergence of the belief in the attitude's classes from the soft label, averaged where `weight` is 1. 0 at best.
+    """Kullback-Leibler divergence of the attitude's classes from their soft label. 0 at best.
 
-    attitude: logits; label: `AttitudeBins.soft_label`
+    Args:
+        attitude: (b, k) logits.
+        label: (b, k) of `AttitudeBins.soft_label`.
+        weight: (b,) 1 where there is a pose, else 0.
+
+    Returns:
+        The mean over the samples with a pose.
     """
     divergence = (label * (label.clamp(min=TINY).log() - attitude.log_softmax(dim=1))).sum(dim=1)
     return (divergence * weight).sum() / weight.sum().clamp(min=1)
@@ -72,15 +99,22 @@ def attitude_loss(
 def direct_loss(
     branches: PoseBranches, pose: Float[Tensor, "b 7"], label: Float[Tensor, "b k"], weight: Float[Tensor, " b"]
 ) -> Float[Tensor, ""]:
-    """Smooth L1 of the offset and of log_depth, and the divergence of the attitude's belief from its soft label.
+    """Loss of direct pose regression: smooth L1 of offset and log depth, and `attitude_loss`. 0 at best.
 
-    0 at best. pose: `CropPose.vector`, finite; label: `AttitudeBins.soft_label`; weight: 0 where there is no pose.
+    Args:
+        branches: Of the network.
+        pose: (b, 7) of `CropPose.vector`, finite.
+        label: (b, k) of `AttitudeBins.soft_label`.
+        weight: (b,) 1 where there is a pose, else 0.
+
+    Returns:
+        The mean over the samples with a pose.
     """
     offset = functional.smooth_l1_loss(branches.offset, pose[:, :2], beta=SMOOTH, reduction="none").sum(dim=1)
     depth = functional.smooth_l1_loss(branches.log_depth, pose[:, 2], beta=SMOOTH, reduction="none")
-    place = OFFSET_WEIGHT * offset + DEPTH_WEIGHT * depth
-    placed = (place * weight).sum() / weight.sum().clamp(min=1)
-    return placed + attitude_loss(branches.attitude, label, weight)
+    position = OFFSET_WEIGHT * offset + DEPTH_WEIGHT * depth
+    mean_position = (position * weight).sum() / weight.sum().clamp(min=1)
+    return mean_position + attitude_loss(branches.attitude, label, weight)
 
 
 def box_iou(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b"]:
@@ -99,12 +133,20 @@ def locator_loss(
     stride: int,
     sigma_cells: float,
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of the centre's map, smooth L1 and 1 - IoU of the box at the cells near the centre."""
+    """Cross-entropy of the centre's map, smooth L1 and 1 - IoU of the box at the cells near the centre.
+
+    Args:
+        output: (b, 5, h, w), the centre's map and the distances to the box's sides, in sides of the input.
+        corners_px: (b, 2, 2) upper left and lower right corner in pixels of the input.
+        weight: (b, 2) 1 where the box is there, else 0.
+        stride: Input pixels per cell.
+        sigma_cells: Standard deviation of the centre's target.
+    """
     height, width = output.shape[2:]
     size = torch.tensor([width * stride, height * stride], device=output.device, dtype=torch.float32)
-    seen = weight[:, 0]
+    is_there = weight[:, 0]
     centre = corners_px.mean(dim=1, keepdim=True)
-    target = gaussian_targets(centre, stride, height, width, sigma_cells)[:, 0] * seen[:, None, None]
+    target = gaussian_targets(centre, stride, height, width, sigma_cells)[:, 0] * is_there[:, None, None]
     heat = output[:, 0].float().clamp(1e-5, 1 - 1e-5)
     centre_loss = functional.binary_cross_entropy(heat, target, reduction="none").sum(dim=(1, 2)).mean()
     x = (torch.arange(width, device=output.device) + 0.5) / width
@@ -119,4 +161,4 @@ def locator_loss(
     boxes = [torch.cat([-d[:, :2], d[:, 2:]], dim=1).movedim(1, -1) for d in (distance, true)]
     overlap = 1 - box_iou(boxes[0], boxes[1])
     box_loss = ((10 * l1 + 2 * overlap) * share).sum(dim=(1, 2))
-    return CENTRE_WEIGHT * centre_loss + (box_loss * seen).sum() / seen.sum().clamp(min=1)
+    return CENTRE_WEIGHT * centre_loss + (box_loss * is_there).sum() / is_there.sum().clamp(min=1)

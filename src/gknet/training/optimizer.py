@@ -19,11 +19,11 @@ ROUNDS = 5
 RMS = 0.2
 """Of an update over its learning rate: about what AdamW's is, so that one learning rate serves both (Liu 2025)."""
 SMALLEST = 8
-"""A matrix with fewer rows or columns has few directions to balance: AdamW takes it."""
+"""Matrices with fewer rows or columns have few directions to balance and get AdamW."""
 
 
 def orthogonalised(matrices: Float[Tensor, "k r c"]) -> Float[Tensor, "k r c"]:
-    """U V^T of each matrix U S V^T, roughly: every direction of an update counts about the same."""
+    """About U V^T of each matrix U S V^T: every direction of an update counts about the same."""
     a, b, c = QUINTIC
     x = matrices / matrices.norm(dim=(1, 2), keepdim=True).clamp(min=1e-7)
     tall = x.shape[1] > x.shape[2]
@@ -42,11 +42,18 @@ class Muon(torch.optim.Optimizer):
     """
 
     def __init__(self, groups: Sequence[dict[str, Any]], lr: float, momentum: float = 0.95) -> None:
-        """groups: as of any optimizer; those with "matrices": True are orthogonalised."""
+        """As any optimizer.
+
+        Args:
+            groups: Of parameters; those with "matrices": True are orthogonalised.
+            lr: The learning rate.
+            momentum: Of the running mean of the gradient.
+        """
         super().__init__(groups, {"lr": lr, "weight_decay": 0.0, "momentum": momentum, "matrices": False})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """One step, see `torch.optim.Optimizer.step`."""
         value = None
         if closure is not None:
             with torch.enable_grad():
@@ -109,7 +116,7 @@ def _matrix_shape(parameter: Tensor) -> tuple[int, int]:
 
 
 def make_optimizer(network: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
-    """As `settings.optimizer` says; only matrices and kernels decay."""
+    """The optimizer of the settings; only matrices and kernels decay."""
     rate, decay = settings.learning_rate, settings.weight_decay
     many = [p for p in network.parameters() if p.ndim > 1]
     vectors = {"params": [p for p in network.parameters() if p.ndim <= 1], "weight_decay": 0.0}

@@ -29,11 +29,11 @@ logger = logging.getLogger(__name__)
 
 BF16_FLAGS = {"avx512_bf16", "amx_bf16"}
 PICTURE_SIZE = 256
-"""Side of a cached whole picture: the locator's input."""
+"""Side of a cached whole image: the locator's input."""
 
 
 def cpu_has_bf16() -> bool:
-    """Whether this CPU multiplies bfloat16 in hardware; elsewhere it would only be slower."""
+    """Whether this CPU multiplies bfloat16 in hardware; where it does not, bfloat16 is slower."""
     try:
         flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
@@ -101,7 +101,7 @@ def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings)
 
 
 def check_cameras(network: Network, frames: FrameSource) -> None:
-    """Refuse pixels that are not square to a direct network: a rotated picture of them is that of no camera."""
+    """Refuse pixels that are not square to a direct network: a rotated image of them is that of no camera."""
     if not isinstance(network, DMANet):
         return
     for i in range(len(frames)):

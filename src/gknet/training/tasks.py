@@ -94,7 +94,7 @@ class KeypointTask:
         targets = gaussian_targets(points, keypoint_network.stride, height, width, SIGMA_CELLS)
         loss = torch.zeros((), device=device)
         if keypoint_network.two_pass:
-            prompted = batch.told.to(device)
+            prompted = batch.prompted.to(device)
             branches = cast(GKNet, network).branches(image, KeypointPrompts(targets, prompted))
             loss = loss + FIRST_PASS_WEIGHT * measure(cast(Tensor, branches.first_pass), targets, weight)
             weight = weight * ~prompted

@@ -63,7 +63,7 @@ class InterruptibleFrames(Sequence[Frame]):
 
 
 def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray], ndarray]:
-    """A torch network as the estimator sees networks: numpy in, numpy out, in float32."""
+    """A torch network as the estimators call it: numpy in, numpy out, float32."""
 
     def run(images: Float32[ndarray, "b 3 s s"]) -> Float32[ndarray, "b c *cells"]:
         with torch.inference_mode():
@@ -74,7 +74,7 @@ def numpy_network(network: nn.Module, device: torch.device) -> Callable[[ndarray
 
 
 def _usable(frames: Sequence[Frame], rows: Sequence[int], spacecraft: Spacecraft) -> Iterator[tuple[int, Frame]]:
-    """The rows and frames that can be read and that show the craft, one at a time; the others are logged."""
+    """The rows and frames that can be read and that show the spacecraft, one at a time; the others are logged."""
     found = 0
     for row in rows:
         try:
@@ -111,7 +111,7 @@ def validate_keypoints(
     spacecraft: Spacecraft,
     input_size: int,
 ) -> Validation:
-    """The oracle crop's errors; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
+    """Errors in the oracle crop; the score is the mean RMSE in pixels of the 256 crop (eq. 6)."""
     network.eval()
     settings = InferenceSettings(input_size=input_size)
     run = numpy_network(network, device)
@@ -152,7 +152,7 @@ def validate_direct(
     bins: AttitudeBins,
     input_size: int,
 ) -> Validation:
-    """The oracle crop's errors; the score is that of the keypoint networks, of the points where the pose puts them."""
+    """Errors in the oracle crop; the score is that of keypoint networks, with the keypoints projected by the pose."""
     network.eval()
     settings = InferenceSettings(input_size=input_size)
     estimator = DirectEstimator(numpy_network(network, device), spacecraft, bins, settings=settings)
@@ -173,7 +173,8 @@ def validate_locator(
     spacecraft: Spacecraft,
     input_size: int,
 ) -> Validation:
-    """Overlap of the located with the true boxes; the score is 1 minus the part that reaches 0.7, plus the mean gap."""
+    """Overlap of found and true boxes; the score is 1 minus the share with an IoU of 0.7 or more, plus a tenth of
+    1 minus the mean IoU."""
     network.eval()
     run = numpy_network(network, device)
     estimator = KeypointEstimator(
