@@ -55,9 +55,9 @@ from gknet.render.options import Options, Selection
 from gknet.render.render_progress import RenderProgress
 from gknet.training.checkpoint import CHECKPOINT
 from gknet.training.export import export_run
-from gknet.training.loop import train
 from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
+from gknet.training.train import train
 
 DATA_SEED, SWEEP_SEED = 0, 100
 SHIPPED = Path(gknet.__file__).parent / "models"

@@ -43,11 +43,11 @@ from gknet.render.render_progress import RenderProgress
 from gknet.report.write import evaluate_section, write_report
 from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights, save_weights
 from gknet.training.export import export_run
-from gknet.training.loop import train
 from gknet.training.run_file import load_run
 from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
 from gknet.training.setup import make_task
+from gknet.training.train import train
 from gknet.training.validation import validation_rows
 
 KINDS = ("keypoints", "locator")

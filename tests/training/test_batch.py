@@ -1,4 +1,4 @@
-"""The cache keeps the frames' labels; keypoint k stays row k; item i never depends on the order."""
+"""Keypoint k stays row k through every augmentation; sample i never depends on the order."""
 
 from __future__ import annotations
 
@@ -8,19 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.errors import GknetError  # noqa: E402
-from gknet.frame import Box, Frame  # noqa: E402
-from gknet.geometry import Camera, Pose  # noqa: E402
-from gknet.inference.crop import Crop  # noqa: E402
-from gknet.training.batch import Loader, Sample, draw_box, draw_keypoints  # noqa: E402
-from gknet.training.cache import Cache, build_cache, cached_row, craft_window  # noqa: E402
-from gknet.training.schedule import Stage  # noqa: E402
-from tests.training.toy import POINTS, drawn, toy_spacecraft, write_toy  # noqa: E402
+import torch
 
-CRAFT = toy_spacecraft()
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.training.batch import Draw, Loader, Sample, draw_box, draw_keypoints
+from gknet.training.cache import Cache, Window, build_cache
+from gknet.training.schedule import Stage
+from tests.training.toy import CRAFT, Frames, a_frame, toy_spacecraft, write_toy
 
 
 @pytest.fixture(scope="module")
@@ -28,96 +25,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("toy")
     write_toy(root, 12, 3, 96)
     return root
-
-
-def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 512) -> Frame:
-    camera = Camera.from_focal(1.2 * size, size, size)
-    pose = Pose.from_rotation_vector([0.5, 0.2, -0.7], place)
-    return Frame("one", drawn(camera, pose), camera, pose)
-
-
-def box_of(frame: Frame) -> Box:
-    box = frame.true_box(POINTS)
-    assert box is not None
-    return box
-
-
-def test_a_cached_row_is_the_frame_through_a_crop() -> None:
-    frame = a_frame((0.3, -0.2, 30.0))
-    row, box = cached_row(frame, CRAFT, "craft", 160), box_of(frame)
-    assert row is not None
-    crop = craft_window(frame, box, 160)
-    assert crop == Crop.around(box, 160, 1.6)
-    np.testing.assert_allclose(crop.to_image(row.points_px), frame.keypoints_px(POINTS))
-    assert row.in_view.all()
-    np.testing.assert_allclose(
-        row.box_px[2:] - row.box_px[:2], (np.array([box.x1 - box.x0, box.y1 - box.y0])) * crop.scale
-    )
-
-
-def test_a_window_around_the_craft_is_taken_whole() -> None:
-    frame = a_frame((0, 0, 8), 200)
-    assert craft_window(frame, box_of(frame), 160) == Crop(0, 0, 200, 160)
-
-
-def test_truncation_masks_and_never_renumbers() -> None:
-    frame = a_frame((3.0, 0.5, 12.0))
-    row = cached_row(frame, CRAFT, "craft", 160)
-    assert row is not None
-    truth = frame.keypoints_px(POINTS)
-    inside = frame.camera.contains(truth)
-    assert 4 <= inside.sum() < len(POINTS)
-    np.testing.assert_array_equal(row.in_view, inside)
-    np.testing.assert_allclose(row.points_px, craft_window(frame, box_of(frame), 160).to_input(truth))
-
-
-def test_frames_without_the_craft_are_no_rows() -> None:
-    assert cached_row(a_frame((40.0, 0.0, 12.0)), CRAFT, "craft", 64) is None
-    behind = replace(a_frame(), cam_from_body=Pose(np.eye(3), np.array([0, 0, -20.0])))
-    assert cached_row(behind, CRAFT, "craft", 64) is None
-
-
-class Frames:
-    """A dataset in memory; frame `bad` cannot be read."""
-
-    def __init__(self, frames: list[Frame], bad: int = -1) -> None:
-        self.frames, self.bad, self.reads = frames, bad, 0
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def frame(self, i: int, image: bool = True) -> Frame:
-        if image:
-            self.reads += 1
-            if i == self.bad:
-                raise GknetError("frame 1: truncated")
-        return self.frames[i] if image else replace(self.frames[i], image=None)
-
-
-def test_the_cache_is_built_once_skips_bad_frames_and_notices_changes(tmp_path: Path) -> None:
-    frames = Frames([a_frame((0.2 * k, 0, 12), 128) for k in range(5)], bad=1)
-    reports: list[str] = []
-    place = tmp_path / "cache"
-    cache = build_cache(frames, CRAFT, place, 64, report=reports.append)
-    assert len(cache) == 4
-    assert reports == ["left out: frame 1: truncated"]
-    again = build_cache(frames, CRAFT, place, 64)
-    assert frames.reads == 5
-    np.testing.assert_array_equal(again.images, cache.images)
-    frames.frames[0] = a_frame((0.0, 0.1, 12), 128)
-    assert not np.array_equal(build_cache(frames, CRAFT, place, 64).points_px[0], cache.points_px[0])
-    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["cache"]  # the stale one is gone
-
-
-def test_the_cache_keeps_every_point_in_its_row_and_below_the_pixel(tmp_path: Path) -> None:
-    frames = [a_frame((3.0 - k, 0.5, 12.0), 256) for k in range(3)]
-    cache = build_cache(Frames(frames), CRAFT, tmp_path / "cache", 96)
-    for row, frame in enumerate(frames):
-        truth = frame.keypoints_px(POINTS)
-        expected = craft_window(frame, box_of(frame), 96).to_input(truth)
-        np.testing.assert_allclose(cache.points_px[row], expected, atol=1e-3)
-        np.testing.assert_array_equal(cache.in_view[row], frame.camera.contains(truth))
-    assert not cache.in_view.all()
 
 
 def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -> None:
@@ -138,16 +45,9 @@ def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -
     assert masked > 20
 
 
-def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
-    for frames in ([], [a_frame((40.0, 0.0, 12.0), 64)]):
-        with pytest.raises(GknetError, match="cache"):
-            build_cache(Frames(frames), CRAFT, tmp_path / "cache", 64)
-    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
-
-
-def loader(folder: Path, draw=draw_keypoints, **options: int) -> Loader:
+def loader(folder: Path, draw: Draw = draw_keypoints, **options: int) -> Loader:
     data = SkdDataset(folder, "train", "satellite_01")
-    window = "picture" if draw is draw_box else "craft"
+    window: Window = "picture" if draw is draw_box else "craft"
     return Loader(build_cache(data, data.spacecraft, folder / f"cache_{window}", 96, window), draw, 7, **options)
 
 
@@ -205,7 +105,7 @@ def test_processes_share_the_samples_of_one(folder: Path) -> None:
 
 
 def test_an_error_in_the_thread_reaches_the_loop(folder: Path) -> None:
-    def broken(*_: object) -> None:
+    def broken(*_: object) -> Sample:
         raise GknetError("no such sample")
 
     stream = loader(folder, broken).batches(0, lambda place: Stage(1, 64, 2))

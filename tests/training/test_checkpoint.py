@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.errors import GknetError  # noqa: E402
-from gknet.training.checkpoint import TrainingState, load_checkpoint, save_checkpoint  # noqa: E402
+import torch
+
+from gknet.errors import GknetError
+from gknet.training.checkpoint import TrainingState, load_checkpoint, save_checkpoint
 
 
 @dataclass(frozen=True)

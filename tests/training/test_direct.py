@@ -10,35 +10,37 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
-import gknet.training.export as exporting  # noqa: E402
-from gknet.cli.main import run as command  # noqa: E402
-from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.errors import GknetError  # noqa: E402
-from gknet.frame import Frame  # noqa: E402
-from gknet.geometry import Camera, Pose  # noqa: E402
-from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.inference.crop import Crop  # noqa: E402
-from gknet.inference.crop_pose import CropPose  # noqa: E402
-from gknet.inference.direct_estimator import DirectEstimator, decode_output  # noqa: E402
-from gknet.inference.load import load_estimator  # noqa: E402
-from gknet.network.build import build  # noqa: E402
-from gknet.network.direct_pose import PoseBranches  # noqa: E402
-from gknet.network.dmanet import DMANet, DMANetConfig  # noqa: E402
-from gknet.training.augment import Augmentation, craft_warp, rotation  # noqa: E402
-from gknet.training.batch import Loader, draw_box, draw_keypoints  # noqa: E402
-from gknet.training.cache import Cache, build_cache, cached_row, craft_window  # noqa: E402
-from gknet.training.export import export_run  # noqa: E402
-from gknet.training.loop import train  # noqa: E402
-from gknet.training.loss import direct_loss  # noqa: E402
-from gknet.training.schedule import Stage  # noqa: E402
-from gknet.training.settings import TrainSettings  # noqa: E402
-from gknet.training.setup import check_cameras, make_task  # noqa: E402
-from gknet.training.tasks import DirectTask  # noqa: E402
-from gknet.training.validation import validate_direct  # noqa: E402
-from tests.training.toy import POINTS, drawn, toy_spacecraft  # noqa: E402
+import torch
+
+import gknet.training.export as exporting
+from gknet.cli.main import run as command
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.frame import Frame
+from gknet.geometry import Camera, Pose
+from gknet.inference.attitude import AttitudeBins
+from gknet.inference.crop import Crop
+from gknet.inference.crop_pose import CropPose
+from gknet.inference.direct_estimator import DirectEstimator, decode_output
+from gknet.inference.load import load_estimator
+from gknet.network.build import build
+from gknet.network.direct_pose import PoseBranches
+from gknet.network.dmanet import DMANet, DMANetConfig
+from gknet.training.augment import Augmentation, craft_warp, rotation
+from gknet.training.batch import Loader, draw_box, draw_keypoints
+from gknet.training.cache import Cache, build_cache, cached_row, craft_window
+from gknet.training.export import export_run
+from gknet.training.loss import direct_loss
+from gknet.training.schedule import Stage
+from gknet.training.settings import TrainSettings
+from gknet.training.setup import check_cameras, make_task
+from gknet.training.tasks import DirectTask
+from gknet.training.train import train
+from gknet.training.validation import validate_direct
+from tests.training.toy import POINTS, drawn, toy_spacecraft
 
 CRAFT = toy_spacecraft()
 CACHE_SIZE, INPUT_SIZE = 160, 64
@@ -235,6 +237,7 @@ def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     found = validate_direct(exported(estimator), torch.device("cpu"), frames, [0, 1], CRAFT, estimator.bins, 64)
     assert found.score == pytest.approx(best["score"], rel=0.02)
     frame = frames.frame(0)
+    assert frame.image is not None
     estimate = estimator.estimate(frame.image, frame.camera, frame.true_box(POINTS))
     assert (estimate.cam_from_body is None) == (estimate.failure is not None)
     assert (estimate.attitude_confidence is None) == (estimate.cam_from_body is None)

@@ -14,20 +14,22 @@ from typing import Any
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
-import gknet.training.learner as learner  # noqa: E402
-import gknet.training.loop as loop  # noqa: E402
-from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.errors import GknetError  # noqa: E402
-from gknet.io.interrupt import Interrupted  # noqa: E402
-from gknet.io.lock import locked  # noqa: E402
-from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
-from gknet.training.loop import train  # noqa: E402
-from gknet.training.run_file import load_run  # noqa: E402
-from gknet.training.schedule import Stage  # noqa: E402
-from gknet.training.settings import TrainSettings  # noqa: E402
+import torch
+
+import gknet.training.learner as learner
+import gknet.training.loop as loop
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.io.interrupt import Interrupted
+from gknet.io.lock import locked
+from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights
+from gknet.training.run_file import load_run
+from gknet.training.schedule import Stage
+from gknet.training.settings import TrainSettings
+from gknet.training.train import train
 
 SETTINGS = TrainSettings(
     network="locator",
@@ -177,7 +179,16 @@ def test_a_kill_between_the_weights_and_the_checkpoint_leaves_weights_and_record
     assert_same(result(straight), result(out))
 
 
-WORDS = ("--spacecraft", "satellite_01", "--network", "locator", "--samples", "36", "--stages", "0.5:32:4,0.5:64:4")
+WORDS: tuple[str, ...] = (
+    "--spacecraft",
+    "satellite_01",
+    "--network",
+    "locator",
+    "--samples",
+    "36",
+    "--stages",
+    "0.5:32:4,0.5:64:4",
+)
 WORDS += ("--precision", "32-true", "--device", "cpu", "--cache-size", "96", "--val-frames", "2", "--validations", "3")
 SLOWLY = """
 import time

@@ -10,22 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
-import gknet.training.export as exporting  # noqa: E402
-from gknet.errors import GknetError  # noqa: E402
-from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.inference.load import load_estimator  # noqa: E402
-from gknet.inference.onnx_model import OnnxModel  # noqa: E402
-from gknet.io.spacecraft_file import spacecraft_from_toml  # noqa: E402
-from gknet.network.build import build  # noqa: E402
-from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights  # noqa: E402
-from gknet.training.export import export_run  # noqa: E402
-from gknet.training.loop import train  # noqa: E402
-from gknet.training.run_file import load_run  # noqa: E402
-from gknet.training.schedule import Stage  # noqa: E402
-from gknet.training.settings import TrainSettings  # noqa: E402
+import torch
+
+import gknet.training.export as exporting
+from gknet.errors import GknetError
+from gknet.inference.attitude import AttitudeBins
+from gknet.inference.load import load_estimator
+from gknet.inference.onnx_model import OnnxModel
+from gknet.io.spacecraft_file import spacecraft_from_toml
+from gknet.network.build import build
+from gknet.training.checkpoint import BEST, CHECKPOINT, load_weights
+from gknet.training.export import export_run
+from gknet.training.run_file import load_run
+from gknet.training.schedule import Stage
+from gknet.training.settings import TrainSettings
+from gknet.training.train import train
 
 SETTINGS = TrainSettings(
     epochs=3,
@@ -103,11 +105,12 @@ def test_a_warm_start_takes_what_fits(finished: Path) -> None:
     from gknet.training.checkpoint import warm_start
 
     other = build("gknet-s", np.eye(5, dtype=bool), np.eye(5, 3))
-    queries = other.decoder.queries.clone()
+    queries = other.state_dict()["decoder.queries"].clone()
     taken, total = warm_start(other, finished / BEST)
     assert 0.9 * total < taken < total
-    assert torch.equal(other.encoder.stem.conv.weight, load_weights(finished / BEST)["encoder.stem.conv.weight"])
-    assert torch.equal(other.decoder.queries, queries)
+    name = "encoder.stem.conv.weight"
+    assert torch.equal(other.state_dict()[name], load_weights(finished / BEST)[name])
+    assert torch.equal(other.state_dict()["decoder.queries"], queries)
     with pytest.raises(GknetError, match="cannot read"):
         warm_start(other, finished / "run.json")
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from gknet.inference.decode import SPREAD_CELLS, decode_heatmaps  # noqa: E402
-from gknet.inference.locator import decode_locator  # noqa: E402
-from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS  # noqa: E402
-from gknet.training.loss import (  # noqa: E402
+from gknet.inference.decode import SPREAD_CELLS, decode_heatmaps
+from gknet.inference.locator import decode_locator
+from gknet.network.heatmap import SHARPNESS, SIGMA_CELLS
+from gknet.training.loss import (
     box_iou,
     gaussian_targets,
     heatmap_loss,
@@ -39,7 +42,7 @@ class Counted(TorchDispatchMode):
 
     operations = 0
 
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.operations += 1
         return func(*args, **(kwargs or {}))
 

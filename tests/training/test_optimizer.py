@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 
-from gknet.errors import GknetError  # noqa: E402
-from gknet.network.build import NETWORKS, build  # noqa: E402
-from gknet.training.optimizer import Muon, make_optimizer, orthogonalised  # noqa: E402
-from gknet.training.settings import TrainSettings  # noqa: E402
+import torch
+
+from gknet.errors import GknetError
+from gknet.network.build import NETWORKS, build
+from gknet.training.optimizer import Muon, make_optimizer, orthogonalised
+from gknet.training.settings import TrainSettings
 
 CHAIN = np.eye(8, dtype=bool) | np.eye(8, k=1, dtype=bool) | np.eye(8, k=-1, dtype=bool)
 POINTS = np.random.default_rng(0).uniform(-1, 1, (8, 3))

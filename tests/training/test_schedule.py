@@ -10,7 +10,6 @@ from gknet.errors import GknetError
 from gknet.network.build import NETWORKS
 from gknet.network.spec import Stage
 from gknet.training.schedule import Budget, learning_rate, parse_stages, stage_at
-from gknet.training.settings import TrainSettings
 
 
 def test_stages_follow_their_shares() -> None:
@@ -44,22 +43,9 @@ def test_budgets_by_clock_and_by_samples() -> None:
     assert Budget(minutes=2).progress(10**9, 60) == pytest.approx(0.5)
     assert Budget(samples=1000).progress(250, 1e9) == pytest.approx(0.25)
     assert Budget(samples=10).progress(25, 0) == 1
-    for bad in ({}, {"minutes": 1, "samples": 1}, {"minutes": 0}, {"samples": -1}):
+    for minutes, samples in ((None, None), (1, 1), (0, None), (None, -1)):
         with pytest.raises(GknetError, match="budget"):
-            Budget(**bad)
-
-
-def test_settings_name_what_is_wrong() -> None:
-    for bad in ({}, {"minutes": 1, "epochs": 1}, {"samples": 9, "epochs": 1}):
-        with pytest.raises(GknetError, match="--samples, --epochs or --minutes"):
-            TrainSettings(**bad)
-    with pytest.raises(GknetError, match="network"):
-        TrainSettings(epochs=1, network="hourglass")
-    for rate in (0, -1, float("nan")):
-        with pytest.raises(GknetError, match="learning_rate"):
-            TrainSettings(epochs=1, learning_rate=rate)
-    with pytest.raises(GknetError, match="ema"):
-        TrainSettings(epochs=1, ema=1.0)
+            Budget(minutes, samples)
 
 
 def test_warm_restarts() -> None:
@@ -68,15 +54,3 @@ def test_warm_restarts() -> None:
     assert rates[100] == pytest.approx(0)
     assert rates[30] == pytest.approx(0.5)
     assert max(rates[15:20]) < 0.2
-
-
-def test_choices_that_a_network_does_not_have_are_refused() -> None:
-    for network in ("hrnet-xs", "resunet", "locator"):
-        with pytest.raises(GknetError, match="graph"):
-            TrainSettings(network, "identity", epochs=1)
-    with pytest.raises(GknetError, match="loss"):
-        TrainSettings("locator", loss="squared", epochs=1)
-    with pytest.raises(GknetError, match="cycles"):
-        TrainSettings(epochs=1, cycles=0)
-    assert TrainSettings("hrnet", epochs=1).chosen_loss == "squared"
-    assert TrainSettings("hrnet", loss="likelihood", epochs=1).chosen_loss == "likelihood"

@@ -10,17 +10,19 @@ from types import ModuleType
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("mitsuba")
 
-from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.errors import GknetError  # noqa: E402
-from gknet.inference.load import load_estimator  # noqa: E402
-from gknet.network.build import build  # noqa: E402
-from gknet.render.recipe import RECIPES  # noqa: E402
-from gknet.training.checkpoint import BEST, load_weights, save_weights  # noqa: E402
-from gknet.training.schedule import Stage  # noqa: E402
+import torch
+
+from gknet.dataset.skd import SkdDataset
+from gknet.errors import GknetError
+from gknet.inference.load import load_estimator
+from gknet.network.build import build
+from gknet.render.recipe import RECIPES
+from gknet.training.checkpoint import BEST, load_weights, save_weights
+from gknet.training.schedule import Stage
 
 CRAFT = "satellite_01"
 STAGES = (Stage(1.0, 64, 4),)

@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.network.heatmap import SIGMA_CELLS, HeatmapBranches, KeypointPrompts  # noqa: E402
-from gknet.training.batch import Batch  # noqa: E402
-from gknet.training.loss import gaussian_targets, heatmap_loss  # noqa: E402
-from gknet.training.tasks import ATTITUDE_WEIGHT, FIRST_PASS_WEIGHT, KeypointTask  # noqa: E402
-from tests.training.toy import toy_spacecraft  # noqa: E402
+import torch
+
+from gknet.inference.attitude import AttitudeBins
+from gknet.network.heatmap import SIGMA_CELLS, HeatmapBranches, KeypointPrompts
+from gknet.training.batch import Batch
+from gknet.training.loss import gaussian_targets, heatmap_loss
+from gknet.training.tasks import ATTITUDE_WEIGHT, FIRST_PASS_WEIGHT, KeypointTask
+from tests.training.toy import toy_spacecraft
 
 CPU = torch.device("cpu")
 BATCH = Batch(

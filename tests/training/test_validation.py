@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.dataset.skd import SkdDataset  # noqa: E402
-from gknet.network.build import build  # noqa: E402
-from gknet.training.validation import validate_keypoints, validate_locator  # noqa: E402
-from tests.training.toy import write_toy  # noqa: E402
+import torch
+
+from gknet.dataset.skd import SkdDataset
+from gknet.network.build import build
+from gknet.network.heatmap import HeatmapNetwork
+from gknet.training.validation import validate_keypoints, validate_locator
+from tests.training.toy import write_toy
 
 CPU = torch.device("cpu")
 
@@ -36,6 +39,7 @@ def test_the_score_is_the_mean_over_all_rows(frames: SkdDataset) -> None:
     spacecraft = frames.spacecraft
     torch.manual_seed(0)
     network = build("gknet-s", spacecraft.adjacency, spacecraft.points_m)
+    assert isinstance(network, HeatmapNetwork)
 
     def rmse_px(rows: list[int]) -> float:
         return validate_keypoints(network, CPU, frames, rows, spacecraft, 64).values["rmse_px"]

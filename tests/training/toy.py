@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from gknet.dataset.skd_format import Annotation, row_of
 from gknet.dataset.skd_write import write_annotations, write_frame_files, write_sequence_files, write_splits
+from gknet.errors import GknetError
+from gknet.frame import Box, Frame
 from gknet.geometry import Camera, Pose
 from gknet.io.spacecraft_file import save_spacecraft
 from gknet.spacecraft import Spacecraft
@@ -29,7 +32,20 @@ FACES = {
     (8, 9, 11, 10): (40, 50, 160),
     (12, 13, 15, 14): (60, 40, 150),
 }
-EDGES = ((0, 1), (0, 2), (1, 3), (2, 3), (4, 5), (4, 6), (5, 7), (6, 7), (0, 4), (1, 5), (2, 6), (3, 7))
+EDGES: tuple[tuple[int, int], ...] = (
+    (0, 1),
+    (0, 2),
+    (1, 3),
+    (2, 3),
+    (4, 5),
+    (4, 6),
+    (5, 7),
+    (6, 7),
+    (0, 4),
+    (1, 5),
+    (2, 6),
+    (3, 7),
+)
 EDGES += ((8, 9), (8, 10), (9, 11), (10, 11), (12, 13), (12, 14), (13, 15), (14, 15), (5, 16), (7, 16))
 
 
@@ -79,3 +95,35 @@ def write_toy(root: Path, train: int, val: int, size: int = 128, seed: int = 0) 
         write_annotations(folder, rows)
     write_splits(root, lambda sequence: ("train", "val")[sequence], lambda sequence: "satellite_01")
     return spacecraft
+
+
+CRAFT = toy_spacecraft()
+
+
+def a_frame(place: tuple[float, float, float] = (0.3, -0.2, 12.0), size: int = 512) -> Frame:
+    camera = Camera.from_focal(1.2 * size, size, size)
+    pose = Pose.from_rotation_vector([0.5, 0.2, -0.7], place)
+    return Frame("one", drawn(camera, pose), camera, pose)
+
+
+def box_of(frame: Frame) -> Box:
+    box = frame.true_box(POINTS)
+    assert box is not None
+    return box
+
+
+class Frames:
+    """A dataset in memory; frame `bad` cannot be read."""
+
+    def __init__(self, frames: list[Frame], bad: int = -1) -> None:
+        self.frames, self.bad, self.reads = frames, bad, 0
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def frame(self, i: int, image: bool = True) -> Frame:
+        if image:
+            self.reads += 1
+            if i == self.bad:
+                raise GknetError("frame 1: truncated")
+        return self.frames[i] if image else replace(self.frames[i], image=None)

@@ -33,7 +33,7 @@ def train(
     Give one budget: --samples, --epochs or --minutes. After Ctrl-C or SIGTERM, --resume goes on where the run stopped;
     with --samples or --epochs the result is exactly that of a run that never stopped.
     """
-    from gknet.training.loop import train as run
+    from gknet.training.train import train as run
 
     if batch is not None:
         settings = replace(settings, stages=tuple(replace(stage, batch=batch) for stage in settings.input_stages))
