@@ -98,15 +98,16 @@ def direct_stages(estimator: DirectEstimator, given: ndarray, crop: Crop, runs: 
 
 
 def write_paper_network(path: Path) -> None:
-    """gknet-paper for 16 keypoints on a chain, normalisations folded, as an export would have it."""
+    """gknet-paper for 16 keypoints on a chain, as an export would have it."""
     import onnx
     import torch
 
     from gknet.network.build import build
-    from gknet.training.export import folded, onnx_graph
+    from gknet.training.onnx_graph import onnx_graph
 
     chain = np.eye(16, dtype=bool) | np.eye(16, k=1, dtype=bool) | np.eye(16, k=-1, dtype=bool)
-    onnx.save(onnx_graph(folded(build("gknet-paper", chain, np.zeros((16, 3)))), torch.zeros(2, 3, 256, 256)), path)
+    network = build("gknet-paper", chain, np.zeros((16, 3))).eval()
+    onnx.save(onnx_graph(network, torch.zeros(2, 3, 256, 256)), path)
 
 
 def paper_ms(path: Path, threads: int, runs: int) -> float:

@@ -154,10 +154,10 @@ def jobs(work: Path, scale: Scale, start: Path | None, seed: int, kinds: tuple[s
     keypoints: list[Job] = []
     locators: list[Job] = []
     for name, minutes in zip(NAMES, scale.keypoint_minutes, strict=True):
-        init: Path | None = work / "runs" / FIRST / BEST if start is None else start / name / "keypoints.safetensors"
+        init: Path | None = work / "runs" / FIRST / BEST if start is None else start / name / "keypoints.onnx"
         settings = run_settings("gknet-s", minutes, 6, seed, init, scale.stages)
         keypoints.append(Job(work, "crops", name, f"{name}_keypoints", settings))
-        init = None if start is None else start / name / "locator.safetensors"
+        init = None if start is None else start / name / "locator.onnx"
         settings = run_settings("locator", scale.locator_minutes, 3, seed, init, None)
         locators.append(Job(work, "pictures", name, f"{name}_locator", settings))
     return keypoints + (locators if "locator" in kinds else [])
@@ -184,7 +184,7 @@ def check_start(start: Path | None) -> None:
         return
     for name in NAMES:
         for kind in KINDS:
-            load_weights(start / name / f"{kind}.safetensors")
+            load_weights(start / name / f"{kind}.onnx")
 
 
 def train_all(work: Path, scale: Scale, start: Path | None, seed: int, kinds: tuple[str, ...] = KINDS) -> None:
@@ -264,8 +264,7 @@ def ship(work: Path, out: Path, start: Path | None, kinds: tuple[str, ...] = KIN
             export_run(work / "blended" / f"{name}_{kind}", out / name)
         else:
             assert start is not None
-            for suffix in ("onnx", "safetensors"):
-                shutil.copyfile(start / name / f"{kind}.{suffix}", out / name / f"{kind}.{suffix}")
+            shutil.copyfile(start / name / f"{kind}.onnx", out / name / f"{kind}.onnx")
 
 
 def judge(work: Path, models: Path, results: Path) -> None:

@@ -82,11 +82,6 @@ def test_an_attitude_puts_keypoints_where_a_camera_far_away_sees_them(chosen: in
     attitude = Rotation.from_quat(BINS.centres_wxyz[chosen, [1, 2, 3, 0]]).as_matrix()
     pixels = camera.project(Pose(smallest_rotation_to(place_m) @ attitude, place_m).transform(POINTS))
     seen = Crop.around(Box.around(pixels), 256).to_input(pixels) / 256
-    shares = BINS.keypoint_prior(POINTS, 16)[chosen]
-    np.testing.assert_allclose(shares.sum(axis=(1, 2)), 1)
-    centres = (np.arange(16) + 0.5) / 16
-    expected = np.stack([shares.sum(axis=1) @ centres, shares.sum(axis=2) @ centres], axis=1)
-    assert np.abs(expected - seen).max() < 0.02
     assert np.abs(BINS.expected_keypoints(POINTS)[chosen] - seen).max() < 0.01
 
 

@@ -5,15 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.inference.attitude import AttitudeBins  # noqa: E402
-from gknet.network.attitude_prior import PRIOR_FLOOR, AttitudePrior  # noqa: E402
-from tests.network.tiny import points, tiny  # noqa: E402
+import torch
+
+from gknet.inference.attitude import AttitudeBins
+from gknet.network.attitude_prior import PRIOR_FLOOR, PRIOR_SIGMA, AttitudePrior
+from tests.network.tiny import points, tiny
 
 BINS = AttitudeBins(6)
-PRIOR = torch.from_numpy(BINS.keypoint_prior(points(5), 8)).float()
 EXPECTED = torch.from_numpy(BINS.expected_keypoints(points(5))).float()
+
+
+def gaussians() -> torch.Tensor:
+    """(k, n, 8, 8), each map summing to 1: how likely a keypoint lies in a cell under a class."""
+    y, x = np.mgrid[0:8, 0:8] / 8 + 1 / 16
+    away = np.stack([x, y], axis=-1) - EXPECTED.numpy().astype(np.float64)[:, :, None, None]
+    density = np.exp(-(away**2).sum(axis=-1) / (2 * PRIOR_SIGMA**2))
+    return torch.from_numpy(density / density.sum(axis=(2, 3), keepdims=True)).float()
+
+
+PRIOR = gaussians()
 
 
 def certain(*classes: int) -> torch.Tensor:
@@ -24,7 +36,7 @@ def certain(*classes: int) -> torch.Tensor:
 
 
 def test_a_prior_is_where_the_attitude_places_each_keypoint() -> None:
-    prior = AttitudePrior(PRIOR, EXPECTED)
+    prior = AttitudePrior(EXPECTED, 8)
     for chosen in (0, 17, 80):
         found = prior(certain(chosen), 8, 8)[0]
         torch.testing.assert_close(found, (64 * PRIOR[chosen] + PRIOR_FLOOR).log())
@@ -33,19 +45,25 @@ def test_a_prior_is_where_the_attitude_places_each_keypoint() -> None:
 
 
 def test_a_prior_excludes_nothing_outright_and_has_any_size() -> None:
-    found = AttitudePrior(PRIOR, EXPECTED)(certain(9).expand(2, -1), 16, 24)
+    found = AttitudePrior(EXPECTED, 8)(certain(9).expand(2, -1), 16, 24)
     assert found.shape == (2, 5, 16, 24)
     assert found.min() >= np.log(PRIOR_FLOOR) - 1e-6
     assert found.max() > 1
 
 
+def test_the_prior_is_a_gaussian_about_the_expected_position() -> None:
+    found = AttitudePrior(EXPECTED, 8).keypoint_prior()
+    torch.testing.assert_close(found, PRIOR.flatten(2).permute(1, 2, 0))
+    torch.testing.assert_close(found.sum(dim=1), torch.ones(5, BINS.count))
+
+
 def test_keypoint_priors_belong_to_the_spacecraft_and_not_to_the_weights() -> None:
-    assert set(AttitudePrior(PRIOR, EXPECTED).state_dict()) == {"gain", "trust"}
+    assert set(AttitudePrior(EXPECTED, 8).state_dict()) == {"gain", "trust"}
 
 
 def test_ambiguous_keypoints_agree_on_the_attitude_that_explains_them_all() -> None:
     """Each keypoint alone finds the symmetric counterpart likelier, or knows nothing, but for two that exclude it."""
-    prior = AttitudePrior(PRIOR, EXPECTED)
+    prior = AttitudePrior(EXPECTED, 8)
     true, counterpart = 30, 47
     probability = (0.4 * PRIOR[true] + 0.6 * PRIOR[counterpart])[None]
     probability[0, 4] = 1 / 64
@@ -58,14 +76,14 @@ def test_ambiguous_keypoints_agree_on_the_attitude_that_explains_them_all() -> N
 
 
 def test_evidence_is_the_same_at_any_resolution() -> None:
-    prior = AttitudePrior(PRIOR, EXPECTED)
+    prior = AttitudePrior(EXPECTED, 8)
     fine = PRIOR[:1].repeat_interleave(3, dim=2).repeat_interleave(3, dim=3) / 9
     torch.testing.assert_close(prior.evidence(fine), prior.evidence(PRIOR[:1]))
 
 
 def test_votes_place_each_keypoint_by_the_others() -> None:
     """In a shifted crop all votes agree. The votes of a wrong keypoint are as wrong; the others correct it."""
-    prior = AttitudePrior(PRIOR, EXPECTED)
+    prior = AttitudePrior(EXPECTED, 8)
     for chosen in (5, 66):
         found = EXPECTED[chosen] + torch.tensor([0.08, -0.05])
         votes = prior.position_votes(certain(chosen), found[None])[0]
@@ -108,7 +126,9 @@ def test_the_attitude_moves_the_maps_and_is_moved_by_them(graph: str) -> None:
         network.attitude.classes.bias.data = certain(chosen, other)[0] + torch.eye(BINS.count)[chosen]
         pixel_maps = PRIOR[other][None].clamp(min=1e-6).log() / 10
         pixel_maps = torch.nn.functional.interpolate(pixel_maps, size=(32, 32))
-        assert network.branches(image).attitude[0].argmax() == other
+        attitude = network.branches(image).attitude
+        assert attitude is not None
+        assert attitude[0].argmax() == other
 
 
 def test_a_network_without_bins_expects_nothing() -> None:

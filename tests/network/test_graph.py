@@ -8,15 +8,17 @@ from typing import cast
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from gknet.errors import GknetError  # noqa: E402
-from gknet.network.backbone import POSITION_WIDTH, fourier_encoding, position_encoding  # noqa: E402
-from gknet.network.build import build  # noqa: E402
-from gknet.network.gknet import GKNet  # noqa: E402
-from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency  # noqa: E402
-from gknet.network.heatmap import SHARPNESS, KeypointPrompts  # noqa: E402
-from tests.network.tiny import chain, points, tiny  # noqa: E402
+import torch
+
+from gknet.errors import GknetError
+from gknet.network.backbone import POSITION_WIDTH, fourier_encoding, position_encoding
+from gknet.network.build import build
+from gknet.network.gknet import GKNet
+from gknet.network.graph import EdgeConvolution, Fusion, GraphConvolution, normalised_adjacency
+from gknet.network.heatmap import SHARPNESS, KeypointPrompts
+from tests.network.tiny import chain, layers_of, points, tiny
 
 
 def test_adjacency_is_normalised_as_in_equation_3() -> None:
@@ -35,12 +37,11 @@ def test_a_matrix_that_is_no_adjacency_is_refused(bad: np.ndarray) -> None:
 
 def test_the_graph_is_a_constant_of_the_spacecraft() -> None:
     network = tiny(6)
-    assert network.decoder is not None
     assert not [name for name in network.state_dict() if "adjacency" in name]
     assert not [name for name, _ in network.named_parameters() if "adjacency" in name]
-    before = network.decoder.layers[0].graph.adjacency.clone()
+    before = layers_of(network)[0].graph.adjacency.clone()
     network(torch.rand(2, 3, 64, 64)).sum().backward()
-    assert torch.equal(before, network.decoder.layers[0].graph.adjacency)
+    assert torch.equal(before, layers_of(network)[0].graph.adjacency)
 
 
 @pytest.mark.parametrize("kind", [GraphConvolution, EdgeConvolution])
@@ -111,9 +112,8 @@ def test_a_vote_goes_along_its_edge_and_no_other() -> None:
 def test_position_votes_enter_the_second_pass_alone_and_start_from_prompted_positions() -> None:
     """A prompted keypoint places its neighbour at the attitude's offset from there."""
     network = tiny(5).eval()
-    assert network.decoder is not None
     votes: list[torch.Tensor | None] = []
-    for layer in network.decoder.layers:
+    for layer in layers_of(network):
         layer.graph.register_forward_hook(lambda module, given, out: votes.append(given[1]))
     network.attitude.classes.weight.data.zero_()
     network.attitude.classes.bias.data = torch.full_like(network.attitude.classes.bias, -400)
@@ -140,7 +140,7 @@ def sampled(pixels: torch.Tensor, prompts: KeypointPrompts | None = None) -> lis
         network.node_filter.weight.zero_()
         network.node_filter.bias.zero_()
     samples: list[torch.Tensor] = []
-    for layer in network.decoder.layers:
+    for layer in layers_of(network):
         layer.sample.register_forward_hook(lambda module, given, out: samples.append(given[0][0, :, 8:]))
     network.branches(torch.rand(1, 3, 64, 64), prompts)
     assert len(samples) == 4  # two layers, two passes

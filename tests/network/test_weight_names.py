@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
-from gknet.network.dmanet import DMANet, DMANetConfig  # noqa: E402
-from gknet.network.weight_names import current_name  # noqa: E402
-from gknet.training.checkpoint import load_weights, save_weights, warm_start  # noqa: E402
-from tests.network.tiny import tiny  # noqa: E402
+import torch
+
+from gknet.network.dmanet import DMANet, DMANetConfig
+from gknet.network.weight_names import current_name
+from gknet.training.checkpoint import load_weights, save_weights, warm_start
+from tests.network.tiny import tiny
 
 OLD_OF_GKNET = {
     "attention_norm.": "after_look.",

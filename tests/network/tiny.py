@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from gknet.network.gknet import GKNet, GKNetConfig
+from gknet.network.graph import GraphLayer
 
 
 def chain(count: int) -> np.ndarray:
@@ -18,6 +19,12 @@ def chain(count: int) -> np.ndarray:
 def points(count: int) -> np.ndarray:
     """(count, 3) keypoints in metres, no two alike."""
     return np.random.default_rng(count).uniform(-1, 1, (count, 3)) * (3, 2, 1)
+
+
+def layers_of(network: GKNet) -> list[GraphLayer]:
+    """The layers of the graph decoder."""
+    assert network.decoder is not None
+    return [layer for layer in network.decoder.layers if isinstance(layer, GraphLayer)]
 
 
 def tiny(count: int, graph: str = "skeleton", bins: int = 4) -> GKNet:

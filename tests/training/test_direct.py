@@ -15,7 +15,6 @@ pytest.importorskip("lightning_fabric")
 
 import torch
 
-import gknet.training.export as exporting
 from gknet.cli.main import run as command
 from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
@@ -226,7 +225,7 @@ def test_pixels_that_are_not_square_leave_the_attitude_unknown() -> None:
 
 def test_export_load_estimate(data: Path, finished: Path, model: Path) -> None:
     """The loaded estimator answers as the trained weights do, in the oracle's crop of a validation frame."""
-    assert {path.name for path in model.iterdir()} == {"direct.onnx", "direct.safetensors"}
+    assert {path.name for path in model.iterdir()} == {"direct.onnx"}
     estimator = load_estimator(model, threads=1)
     assert isinstance(estimator, DirectEstimator)
     assert estimator.locator is None
@@ -251,14 +250,6 @@ def exported(estimator: DirectEstimator) -> torch.nn.Module:
             return torch.from_numpy(estimator.network(np.ascontiguousarray(images.numpy())))
 
     return Exported()
-
-
-def test_an_export_that_differs_is_refused(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    true_run = exporting.run_onnx
-    monkeypatch.setattr(exporting, "run_onnx", lambda model, images: true_run(model, images) + 0.01)
-    with pytest.raises(GknetError, match="tolerance"):
-        export_run(finished, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_holds_one_kind_of_model(model: Path, tmp_path: Path) -> None:

@@ -11,9 +11,11 @@ from types import ModuleType
 import pytest
 
 pytest.importorskip("torch")
+pytest.importorskip("onnx")
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("mitsuba")
 
+import onnx
 import torch
 
 from gknet.dataset.skd import SkdDataset
@@ -21,7 +23,8 @@ from gknet.errors import GknetError
 from gknet.inference.load import load_estimator
 from gknet.network.build import build
 from gknet.render.recipe import RECIPES
-from gknet.training.checkpoint import BEST, load_weights, save_weights
+from gknet.training.checkpoint import BEST, load_weights
+from gknet.training.onnx_graph import WEIGHTS
 from gknet.training.schedule import Stage
 
 CRAFT = "satellite_01"
@@ -96,18 +99,23 @@ def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: Modu
     scale = replace(recipe.SCALES["cpu"], keypoint_minutes=(0.05,), stages=STAGES)
     start = work / "start"
     (start / CRAFT).mkdir(parents=True)
-    for suffix in ("onnx", "safetensors"):
-        (start / CRAFT / f"locator.{suffix}").write_bytes(b"as it was")
+    (start / CRAFT / "locator.onnx").write_bytes(b"as it was")
     other = {name: weight for name, weight in initial(work).items() if not name.startswith("decoder")}
-    save_weights(start / CRAFT / "keypoints.safetensors", other, {})
+    save_as_export(start / CRAFT / "keypoints.onnx", other)
     kinds = ("keypoints",)
     [job] = recipe.jobs(work, scale, start, SEED, kinds)
     recipe.run(job)
     assert list(scores_of(recipe.blend(job), recipe) or {}) == [1.0]
     recipe.ship(work, work / "models", start, kinds)
-    for suffix in ("onnx", "safetensors"):
-        assert (work / "models" / CRAFT / f"locator.{suffix}").read_bytes() == b"as it was"
+    assert (work / "models" / CRAFT / "locator.onnx").read_bytes() == b"as it was"
     assert (work / "models" / CRAFT / "keypoints.onnx").exists()
+
+
+def save_as_export(path: Path, weights: dict[str, torch.Tensor]) -> None:
+    """A file that holds weights as an export does, and no graph that uses them."""
+    tensors = [onnx.numpy_helper.from_array(each.numpy(), WEIGHTS + name) for name, each in weights.items()]
+    graph = onnx.helper.make_graph([], "weights alone", [], [], tensors)
+    path.write_bytes(onnx.helper.make_model(graph).SerializeToString())
 
 
 def initial(work: Path) -> dict[str, torch.Tensor]:
@@ -125,5 +133,5 @@ def scores_of(said: str, recipe: ModuleType) -> dict[float, float] | None:
 
 def test_models_to_start_from_are_looked_at_first(recipe: ModuleType, tmp_path: Path) -> None:
     recipe.check_start(None)
-    with pytest.raises(GknetError, match=r"satellite_01/keypoints\.safetensors"):
+    with pytest.raises(GknetError, match=r"satellite_01/keypoints\.onnx"):
         recipe.check_start(tmp_path)

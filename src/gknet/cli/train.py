@@ -45,12 +45,12 @@ def train(
 
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
-    out: Annotated[Path, typer.Option(help="Folder for keypoints.onnx, direct.onnx or locator.onnx, and the weights.")],
+    out: Annotated[Path, typer.Option(help="Folder for keypoints.onnx, direct.onnx or locator.onnx.")],
     tolerance: Annotated[
         float | None, typer.Option(help="Largest difference from torch, in units of the output.")
     ] = None,
 ) -> None:
-    """Write a run's best weights as one ONNX file with metadata, checked against torch, and as safetensors."""
+    """Write a run's best weights as one ONNX file with metadata, checked against torch."""
     from gknet.training.export import TOLERANCE, export_run
 
     with log_lines():

@@ -19,9 +19,6 @@ LABEL_SIGMA_BINS = 0.6
 CORRECTIONS = 4
 """Steps from the mean of the bins to the attitude whose label has that mean: 0.2 degrees in the mean, then 0.001."""
 
-PRIOR_SIGMA = 0.07
-"""Standard deviation, in sides of the crop, of a keypoint about where its attitude puts it: crops are cut loosely."""
-
 
 def rotation_of(wxyz: Float[ndarray, "*b 4"]) -> Rotation:
     """The rotation of a quaternion, scalar first."""
@@ -138,19 +135,3 @@ class AttitudeBins:
         low, high = rotated.min(axis=1, keepdims=True), rotated.max(axis=1, keepdims=True)
         side = CROP_MARGIN * (high - low).max(axis=2, keepdims=True)
         return (rotated - (low + high) / 2) / side + 0.5
-
-    def keypoint_prior(self, points_m: Float[ndarray, "n 3"], cells: int) -> Float[ndarray, "k n cells cells"]:
-        """The distribution of each keypoint over a crop, for each attitude: a Gaussian of `PRIOR_SIGMA`.
-
-        Args:
-            points_m: (n, 3) in the body frame.
-            cells: On a side of the crop.
-
-        Returns:
-            (k, n, cells, cells), row by row, each map summing to 1.
-        """
-        centres = (np.arange(cells) + 0.5) / cells
-        away = self.expected_keypoints(points_m)[..., None] - centres  # (k, n, xy, cells)
-        along = np.exp(-(away**2) / (2 * PRIOR_SIGMA**2))
-        maps = along[:, :, 1, :, None] * along[:, :, 0, None, :]
-        return maps / maps.sum(axis=(2, 3), keepdims=True)

@@ -9,6 +9,9 @@ from torch.nn import functional
 
 from gknet.network.backbone import ConvNorm
 
+PRIOR_SIGMA = 0.07
+"""Standard deviation, in sides of the crop, of a keypoint about its expected position: crops are cut loosely."""
+
 PRIOR_FLOOR = 0.02
 """Added to a prior whose mean over the cells is 1: what the attitude excludes is unlikely, not impossible."""
 
@@ -37,28 +40,36 @@ class AttitudePrior(nn.Module):
     A single keypoint may be equally likely at two symmetric positions; an attitude places all keypoints consistently.
 
     Attributes:
-        keypoint_prior: (n, cells * cells, k), the probability of each cell for each keypoint under each class.
-        expected_keypoints: (k, n, 2), x and y of each keypoint under each class, in fractions of the crop.
+        expected_keypoints: (k, n, 2), x and y of each keypoint under each class, in fractions of the crop. They belong
+            to the spacecraft, not to the weights: they are computed, never loaded.
+        cells: Side of the maps in which a class places keypoints.
         gain: Learnt weight of the log prior.
         trust: Learnt weight of the evidence of the keypoints. It starts below 1, since their errors are correlated.
     """
 
-    keypoint_prior: Tensor
     expected_keypoints: Tensor
 
-    def __init__(
-        self, keypoint_prior: Float[Tensor, "k n cells cells"], expected_keypoints: Float[Tensor, "k n 2"]
-    ) -> None:
-        """Both arguments are as the functions of that name in `gknet.inference.attitude.AttitudeBins` give them."""
+    def __init__(self, expected_keypoints: Float[Tensor, "k n 2"], cells: int) -> None:
         super().__init__()
-        self.cells = keypoint_prior.shape[-1]
-        # Keypoints first and classes last: both products below read it as it lies in memory. These buffers belong to
-        # the spacecraft, not to the weights: they are computed, never loaded.
-        by_keypoint = keypoint_prior.flatten(2).permute(1, 2, 0).contiguous()
-        self.register_buffer("keypoint_prior", by_keypoint, persistent=False)
+        self.cells = cells
         self.register_buffer("expected_keypoints", expected_keypoints, persistent=False)
         self.gain = nn.Parameter(torch.ones(1))
         self.trust = nn.Parameter(torch.full((1,), 0.3))
+
+    def keypoint_prior(self) -> Float[Tensor, "n cells2 k"]:
+        """The distribution of each keypoint's position under each class: a Gaussian of PRIOR_SIGMA.
+
+        It is a product of a factor along x and one along y, and cheaper to compute than to store: onnxruntime does it
+        once, when it loads the file.
+
+        Returns:
+            (n, cells * cells, k), row by row, summing to 1 over the cells; the classes last, as both products read it.
+        """
+        expected = self.expected_keypoints.permute(2, 1, 0)[:, :, None]  # (xy, n, 1, k)
+        centres = (torch.arange(self.cells, device=expected.device, dtype=expected.dtype) + 0.5) / self.cells
+        along = torch.exp(-((expected - centres[:, None]) ** 2) / (2 * PRIOR_SIGMA**2))  # (xy, n, cells, k)
+        along = along / along.sum(dim=2, keepdim=True)
+        return (along[1][:, :, None] * along[0][:, None]).flatten(1, 2)
 
     def forward(self, attitude: Float[Tensor, "b k"], height: int, width: int) -> Float[Tensor, "b n height width"]:
         """The log prior of each keypoint's position.
@@ -71,8 +82,9 @@ class AttitudePrior(nn.Module):
         Returns:
             (b, n, height, width) logarithms of a density whose mean over the cells is about 1.
         """
-        expected = self.keypoint_prior.flatten(0, 1) @ attitude.float().softmax(dim=1).T  # (n cells cells, b)
-        expected = expected.T.reshape(-1, len(self.keypoint_prior), self.cells, self.cells)
+        prior = self.keypoint_prior()
+        expected = prior.flatten(0, 1) @ attitude.float().softmax(dim=1).T  # (n cells cells, b)
+        expected = expected.T.reshape(-1, len(prior), self.cells, self.cells)
         log_prior = (self.cells**2 * expected + PRIOR_FLOOR).log()
         return self.gain * functional.interpolate(log_prior, size=(height, width), mode="bilinear")
 
@@ -108,5 +120,5 @@ class AttitudePrior(nn.Module):
         """
         height, width = probability.shape[2:]
         shares = functional.avg_pool2d(probability, (height // self.cells, width // self.cells)) * (height * width)
-        agreement = shares.flatten(2).transpose(0, 1) @ self.keypoint_prior  # (n, b, k)
+        agreement = shares.flatten(2).transpose(0, 1) @ self.keypoint_prior()  # (n, b, k)
         return self.trust * (agreement + PRIOR_FLOOR).log().sum(dim=0)

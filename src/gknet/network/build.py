@@ -169,11 +169,3 @@ def build(
     spec = spec_of(name)
     chosen = checked_loss(loss or spec.loss or "likelihood")
     return spec.builder(NetworkOptions(adjacency, points_m, checked_graph(graph), chosen))
-
-
-GRAPH_NETWORKS = tuple(name for name, spec in NETWORKS.items() if spec.has_graph)
-OWN_LOSS_NETWORKS = tuple(name for name, spec in NETWORKS.items() if spec.loss is None)
-
-
-def default_loss(name: str) -> str:
-    return spec_of(name).loss or "likelihood"

@@ -192,10 +192,7 @@ class GKNet(HeatmapNetwork):
         if config.bins:
             bins = AttitudeBins(config.bins)
             self.attitude = AttitudeHead(widths[3] + config.node_width, ATTITUDE_WIDTH, bins.count)
-            self.prior = AttitudePrior(
-                torch.from_numpy(bins.keypoint_prior(points_m, PRIOR_CELLS)).float(),
-                torch.from_numpy(bins.expected_keypoints(points_m)).float(),
-            )
+            self.prior = AttitudePrior(torch.from_numpy(bins.expected_keypoints(points_m)).float(), PRIOR_CELLS)
         self.decoder: GraphDecoder | None = None
         if config.graph != "none":
             self._build_graph_branch(adjacency)

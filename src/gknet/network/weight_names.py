@@ -1,4 +1,4 @@
-"""Names of parameters that have changed, so that weights of version 0.1 still load."""
+"""Names in a state dict: those that have changed, so that weights of version 0.1 still load, and those of no use."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ RENAMED = (
 )
 """Patterns of old names and what replaces them: of GKNet's decoders, then of DMANet."""
 
+COUNTER = "num_batches_tracked"
+"""Of each batch normalisation. Nothing reads it, and PyTorch fills it in where it is missing."""
+
 
 def current_name(name: str) -> str:
     """The name of a parameter today; a name of today stays as it is."""
@@ -32,3 +35,8 @@ def current_name(name: str) -> str:
 def with_current_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Weights of any version under the names of today."""
     return {current_name(name): tensor for name, tensor in weights.items()}
+
+
+def without_counters(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights without the counters of batch normalisations."""
+    return {name: tensor for name, tensor in weights.items() if name.rpartition(".")[2] != COUNTER}

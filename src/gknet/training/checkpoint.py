@@ -21,7 +21,7 @@ from gknet.errors import GknetError
 from gknet.io.atomic import write_bytes
 from gknet.io.text import parse_json, printable, validated
 from gknet.io.torch_file import load_torch_file
-from gknet.network.weight_names import with_current_names
+from gknet.network.weight_names import with_current_names, without_counters
 
 CHECKPOINT = "checkpoint.pt"
 BEST = "best.safetensors"
@@ -162,17 +162,21 @@ def save_weights(path: Path, weights: Mapping[str, Tensor], metadata: Mapping[st
 
 
 def load_weights(path: Path) -> dict[str, Tensor]:
-    """The tensors of a .safetensors file; floating-point ones as float32.
+    """The tensors of a .safetensors file or of an exported .onnx file; floating-point ones as float32.
 
     Raises:
         GknetError: There is no such file, or it is damaged.
     """
+    if path.suffix == ".onnx":
+        from gknet.training.onnx_graph import weights_of_onnx
+
+        return {name: tensor.float() for name, tensor in weights_of_onnx(path).items()}
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise GknetError(f"{path}: cannot read the weights ({error}); expected a .safetensors file") from error
-    tensors = with_current_names(tensors)
+    tensors = without_counters(with_current_names(tensors))
     return {name: tensor.float() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
 
 
@@ -202,7 +206,7 @@ def warm_start(network: nn.Module, path: Path) -> tuple[int, int]:
     Raises:
         GknetError: None fits, or the file cannot be read.
     """
-    own = network.state_dict()
+    own = without_counters(network.state_dict())
     fitting = {
         name: tensor for name, tensor in load_weights(path).items() if name in own and tensor.shape == own[name].shape
     }

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from gknet.network.locator import Locator
 from gknet.network.network import Network
 from gknet.training.batch import Batch
 from gknet.training.optimizer import make_optimizer
@@ -31,7 +30,7 @@ class Learner:
         self.network: nn.Module = network
         self.average = copy.deepcopy(network).to(fabric.device).eval()
         self._model, self.optimizer = fabric.setup(network, make_optimizer(network, settings))
-        if not isinstance(network, Locator):
+        if hasattr(network, "branches"):
             self._model.mark_forward_method("branches")
         self._task, self._settings, self._fabric = task, settings, fabric
 

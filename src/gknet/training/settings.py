@@ -72,7 +72,7 @@ class TrainSettings:
         val_frames: Frames of the val split to validate on, evenly spread.
         validations: How many there are over the budget.
         cache_size: Side of the cached crops in pixels.
-        init: A .safetensors file to start from, of any spacecraft; tensors that do not fit stay fresh.
+        init: A .safetensors or exported .onnx file to start from, of any spacecraft; what does not fit stays fresh.
     """
 
     network: str = "gknet-s"

@@ -15,9 +15,8 @@ from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop_pose import has_square_pixels
-from gknet.network.build import build
-from gknet.network.dmanet import DMANet
-from gknet.network.locator import Locator
+from gknet.network.build import build, spec_of
+from gknet.network.direct_pose import DirectNetwork
 from gknet.network.network import Network
 from gknet.spacecraft import Spacecraft
 from gknet.training.cache import Cache, FrameSource, build_cache
@@ -92,17 +91,20 @@ def make_network(spacecraft: Spacecraft, settings: TrainSettings, is_fresh: bool
 
 def make_task(network: Network, spacecraft: Spacecraft, settings: TrainSettings) -> Task:
     """What the network is trained for."""
-    if isinstance(network, Locator):
-        return LocatorTask(spacecraft, network.stride, settings.input_size)
-    if isinstance(network, DMANet):
-        return DirectTask(spacecraft, AttitudeBins(network.config.bins), settings.input_size)
+    kind, size = spec_of(settings.network).kind, settings.input_size
     bins = None if network.attitude_bins is None else AttitudeBins(network.attitude_bins)
-    return KeypointTask(spacecraft, settings.input_size, settings.auxiliary, bins)
+    if kind == "locator":
+        assert network.stride is not None
+        return LocatorTask(spacecraft, network.stride, size)
+    if kind == "direct":
+        assert bins is not None
+        return DirectTask(spacecraft, bins, size)
+    return KeypointTask(spacecraft, size, settings.auxiliary, bins)
 
 
 def check_cameras(network: Network, frames: FrameSource) -> None:
     """Refuse pixels that are not square to a direct network: a rotated image of them is that of no camera."""
-    if not isinstance(network, DMANet):
+    if not isinstance(network, DirectNetwork):
         return
     for i in range(len(frames)):
         try:
