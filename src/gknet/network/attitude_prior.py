@@ -65,7 +65,7 @@ class AttitudePrior(nn.Module):
         Returns:
             (n, cells * cells, k), row by row, summing to 1 over the cells; the classes last, as both products read it.
         """
-        expected = self.expected_keypoints.permute(2, 1, 0)[:, :, None]  # (xy, n, 1, k)
+        expected = self.expected_keypoints.permute(2, 1, 0).contiguous()[:, :, None]  # (xy, n, 1, k)
         centres = (torch.arange(self.cells, device=expected.device, dtype=expected.dtype) + 0.5) / self.cells
         along = torch.exp(-((expected - centres[:, None]) ** 2) / (2 * PRIOR_SIGMA**2))  # (xy, n, cells, k)
         along = along / along.sum(dim=2, keepdim=True)
