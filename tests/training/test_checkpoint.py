@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,15 @@ pytest.importorskip("torch")
 import torch
 
 from gknet.errors import GknetError
-from gknet.training.checkpoint import TrainingState, load_checkpoint, save_checkpoint
+from gknet.training.checkpoint import (
+    BEST,
+    CHECKPOINT,
+    TrainingState,
+    load_checkpoint,
+    save_checkpoint,
+    save_weights,
+)
+from gknet.training.run_file import TrainingRun, load_run
 
 
 @dataclass(frozen=True)
@@ -34,3 +42,39 @@ def test_a_checkpoint_of_another_shape_of_the_network_is_refused_in_one_short_li
     assert len(str(caught.value)) < 250 + len(str(tmp_path))
     assert "\\n" not in str(caught.value)
     assert load_checkpoint(tmp_path, learned(3), {"seed": "1"}).samples == 7
+
+
+def test_another_training_is_refused_by_what_differs(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, TrainingState(), learned(3), {"seed": "1", "stages": "1:64:4"})
+    with pytest.raises(GknetError, match=r"another training \(stages 1:64:4, now 1:96:2\)"):
+        load_checkpoint(tmp_path, learned(3), {"seed": "1", "stages": "1:96:2"})
+
+
+def test_a_flipped_bit_is_found_wherever_it_is(tmp_path: Path) -> None:
+    """Or it is in the zip file's padding and changes nothing."""
+    saved = learned(3)
+    save_checkpoint(tmp_path, TrainingState(samples=7), saved, {"seed": "1"})
+    path = tmp_path / CHECKPOINT
+    content, found = path.read_bytes(), 0
+    for position in range(0, len(content), len(content) // 200):
+        path.write_bytes(content[:position] + bytes([content[position] ^ 4]) + content[position + 1 :])
+        loaded = learned(3)
+        try:
+            assert load_checkpoint(tmp_path, loaded, {"seed": "1"}).samples == 7
+        except GknetError:
+            found += 1
+            continue
+        for name, tensor in saved.network.state_dict().items():
+            assert torch.equal(loaded.network.state_dict()[name], tensor)
+    assert found > 100
+
+
+def test_weights_carry_the_validation_that_they_are_of(tmp_path: Path) -> None:
+    """A run that was killed between best.safetensors and run.json has an older run.json."""
+    run = TrainingRun("gknet-s", "skeleton", "squared", 64, "", {}, "1", "data", {"score": 2.0})
+    run.save(tmp_path)
+    assert load_run(tmp_path) == run
+    save_weights(tmp_path / BEST, {"w": torch.zeros(2)}, {"best": {"score": 1.0}})
+    assert load_run(tmp_path) == replace(run, best={"score": 1.0})
+    save_weights(tmp_path / BEST, {"w": torch.zeros(2)}, {})
+    assert load_run(tmp_path) == run

@@ -1,11 +1,11 @@
-"""What the recipes say to bad input: one line that names it, and exit code 2."""
+"""Experiments end on bad input with one line that names it, and exit code 2."""
 
 from __future__ import annotations
 
 import json
 import runpy
-import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,27 +24,37 @@ from gknet.training.settings import TrainSettings
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
-def refused(name: str, *words: object) -> str:
-    command = [sys.executable, str(EXPERIMENTS / name), *map(str, words)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert run.returncode == 2, run.stderr
-    assert "Traceback" not in run.stderr
-    return run.stderr
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """Run a script that must end with code 2; what it prints on standard error."""
+
+    def run(name: str, *words: object) -> str:
+        monkeypatch.syspath_prepend(str(EXPERIMENTS))
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(EXPERIMENTS / name), run_name="__main__")
+        assert end.value.code == 2
+        return capsys.readouterr().err
+
+    return run
 
 
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"name": "GKNet", "protocols": {"oracle": {}}}'])
-def test_a_result_that_is_none(content: str, tmp_path: Path) -> None:
+def test_a_result_that_is_none(content: str, refused: Refused, tmp_path: Path) -> None:
     (tmp_path / "cpu").mkdir()
     (tmp_path / "cpu" / "satellite_01_a_0.json").write_text(content)
-    said = refused("paper_report.py", "--results", tmp_path)
-    assert said.startswith("error: ")
-    assert "satellite_01_a_0.json: not a result" in said
-    assert said.count("\n") == 1
+    line = refused("paper_report.py", "--results", tmp_path)
+    assert line.startswith("error: ")
+    assert "satellite_01_a_0.json: not a result" in line
+    assert line.count("\n") == 1
     assert not (tmp_path / "cpu" / "README.md").exists()
 
 
 @pytest.mark.parametrize("path", [("curve",), ("protocols", "oracle", "values", "e_q_rad"), ("protocols", "oracle")])
-def test_a_result_that_lacks_something(path: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_result_that_lacks_something(path: tuple[str, ...], refused: Refused, tmp_path: Path) -> None:
     """As results of an earlier recipe do, of its curve or of a metric."""
     kept = next((EXPERIMENTS.parent / "results" / "paper_tables" / "cpu").glob("satellite_*.json"))
     content = json.loads(kept.read_text(encoding="utf-8"))
@@ -55,14 +65,14 @@ def test_a_result_that_lacks_something(path: tuple[str, ...], tmp_path: Path) ->
     del inner[last]
     (tmp_path / "cpu").mkdir()
     (tmp_path / "cpu" / kept.name).write_text(json.dumps(content))
-    said = refused("paper_report.py", "--results", tmp_path)
-    assert f"{kept.name}: not a result" in said
-    assert f"no {last}" in said
-    assert said.count("\n") == 1
+    line = refused("paper_report.py", "--results", tmp_path)
+    assert f"{kept.name}: not a result" in line
+    assert f"no {last}" in line
+    assert line.count("\n") == 1
 
 
 @pytest.mark.parametrize("content", ["{}", '{"score": NaN}'])
-def test_a_score_that_is_none(content: str, tmp_path: Path) -> None:
+def test_a_score_that_is_none(content: str, refused: Refused, tmp_path: Path) -> None:
     work, sweep = tmp_path / "work" / "cpu", tmp_path / "results" / "cpu" / "sweep"
     work.mkdir(parents=True)
     sweep.mkdir(parents=True)
@@ -72,9 +82,9 @@ def test_a_score_that_is_none(content: str, tmp_path: Path) -> None:
     for name in names:
         (sweep / name).write_text(content)
     folders = ("--work", tmp_path / "work", "--results", tmp_path / "results")
-    said = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
-    assert f"{names[0]}: not a score" in said
-    assert said.count("\n") == 1
+    line = refused("paper_tables.py", *folders, "--spacecraft", "satellite_02")
+    assert f"{names[0]}: not a score" in line
+    assert line.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -145,11 +155,11 @@ def test_a_difference_is_bold_where_each_seed_agrees(
 
 
 @pytest.mark.parametrize("share", ["2/2", "-1/2", "1", "a/b", "0/0"])
-def test_a_share_that_is_none(share: str, tmp_path: Path) -> None:
-    said = refused("paper_tables.py", "--work", tmp_path, "--results", tmp_path, f"--share={share}")
-    assert f"expected I/N with I from 0 to N - 1, got '{share}'" in said
+def test_a_share_that_is_none(share: str, refused: Refused, tmp_path: Path) -> None:
+    line = refused("paper_tables.py", "--work", tmp_path, "--results", tmp_path, f"--share={share}")
+    assert f"expected I/N with I from 0 to N - 1, got '{share}'" in line
 
 
-def test_models_that_are_none(tmp_path: Path) -> None:
+def test_models_that_are_none(refused: Refused, tmp_path: Path) -> None:
     assert "keypoints.onnx" in refused("shipped_tables.py", "--models", tmp_path, "--results", tmp_path)
     assert "no model" in refused("paper_figures.py", "--out", tmp_path, "--work", tmp_path)

@@ -190,6 +190,7 @@ WORDS: tuple[str, ...] = (
     "0.5:32:4,0.5:64:4",
 )
 WORDS += ("--precision", "32-true", "--device", "cpu", "--cache-size", "96", "--val-frames", "2", "--validations", "3")
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 SLOWLY = """
 import time
 import gknet.training.loop as loop
@@ -203,19 +204,38 @@ main()
 """
 
 
-def test_sigterm_saves_and_ends_with_its_code(data: Path, straight: Path, tmp_path: Path) -> None:
-    out, environment = tmp_path / "run", {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", SLOWLY, "train", str(data), *WORDS, "--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment) as process:
+def terminated(command: list[str], out: Path) -> list[str]:
+    """Run a training, send it SIGTERM after its first checkpoint; what it prints on standard error."""
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=ENVIRONMENT) as process:
         while process.poll() is None and not (out / CHECKPOINT).exists():
             time.sleep(0.02)
         process.terminate()
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM, errors
-    assert len(errors.splitlines()) == 1
+    return errors.decode().splitlines()
+
+
+def test_sigterm_saves_and_ends_with_its_code(data: Path, straight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", SLOWLY, "train", str(data), *WORDS, "--out", str(out)]
+    assert len(terminated(command, out)) == 1
     assert 0 < state_of(out)["samples"] < 36
     train(data, "satellite_01", out, SETTINGS, resume=True, quiet=True)
     assert_same(result(straight), result(out))
+
+
+@pytest.mark.slow
+def test_two_processes_stop_after_the_same_step(data: Path, tmp_path: Path) -> None:
+    """DDP on the CPU; the signal reaches one of them."""
+    script, out = tmp_path / "slowly.py", tmp_path / "run"  # a file: the first process starts the second one from it
+    script.write_text(SLOWLY)
+    command = [sys.executable, str(script), "train", str(data), *WORDS, "--devices", "2", "--samples", "48", "--out"]
+    terminated([*command, str(out)], out)
+    assert 0 < state_of(out)["samples"] < 48
+    for words in ([str(out), "--resume"], [str(tmp_path / "straight")]):
+        run = subprocess.run([*command, *words], env=ENVIRONMENT, check=True, capture_output=True, text=True)
+        assert run.stdout.count("best:") == 1
+    assert_same(result(tmp_path / "straight"), result(out))
 
 
 def test_two_trainings_never_write_into_one_folder(data: Path, straight: Path, tmp_path: Path) -> None:

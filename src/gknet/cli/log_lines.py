@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
-from gknet.io.text import printable
+from gknet.cli.terminal import print_line
 
 
 class _LineHandler(logging.Handler):
-    """One line a record. An output that is closed or full ends no command."""
+    """One line a record."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError, ValueError):
-            print(printable(" ".join(self.format(record).split())), flush=True)
+        print_line(" ".join(self.format(record).split()))
 
 
 @contextmanager

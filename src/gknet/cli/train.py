@@ -33,14 +33,17 @@ def train(
     Give one budget: --samples, --epochs or --minutes. After Ctrl-C or SIGTERM, --resume goes on where the run stopped;
     with --samples or --epochs the result is exactly that of a run that never stopped.
     """
+    from lightning_fabric.utilities.rank_zero import rank_zero_only
+
     from gknet.training.train import train as run
 
     if batch is not None:
         settings = replace(settings, stages=tuple(replace(stage, batch=batch) for stage in settings.input_stages))
     with log_lines():
         state = run(data, spacecraft, out, settings, resume, cache, val)
-    best = ", ".join(f"{name} {value:.4g}" for name, value in (state.best or {}).items())
-    print_line(f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min; best: {best or 'none'}")
+    if rank_zero_only.rank == 0:  # type: ignore[attr-defined]  # the first of several processes
+        best = ", ".join(f"{name} {value:.4g}" for name, value in (state.best or {}).items())
+        print_line(f"{out}: {state.samples} samples in {state.elapsed_s / 60:.1f} min; best: {best or 'none'}")
 
 
 def export(

@@ -131,7 +131,7 @@ def _check_sums(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as file:
             damaged = file.testzip()
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
         raise GknetError(f"{path}: not readable as a checkpoint ({error}); train anew in another folder") from error
     if damaged is not None:
         raise GknetError(f"{path}: not readable: {printable(damaged)} in it is damaged; train anew in another folder")
