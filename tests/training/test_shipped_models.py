@@ -68,6 +68,7 @@ def test_a_mean_goes_from_the_old_weights_to_the_new(recipe: ModuleType) -> None
         assert found["count"] == 9
 
 
+@pytest.mark.slow
 def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
     scale = replace(
         recipe.SCALES["cpu"], first_minutes=0.05, keypoint_minutes=(0.05,), locator_minutes=0.05, stages=STAGES
@@ -94,6 +95,7 @@ def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
     assert scores[chosen["share"]] == min(scores.values())
 
 
+@pytest.mark.slow
 def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: ModuleType, work: Path) -> None:
     """And a locator that is kept ships as it was, neither rendered for nor trained."""
     scale = replace(recipe.SCALES["cpu"], keypoint_minutes=(0.05,), stages=STAGES)
