@@ -1,29 +1,28 @@
-"""Milliseconds from pixels to pose, at one and two threads, as ratios to gknet-paper with --paper.
+"""Milliseconds from pixels to pose, at one and two threads, and of peers with --peers.
 
-    python benchmarks/inference.py satellite_01 --paper
+    python benchmarks/inference.py satellite_01 --peers
 
---paper needs the extra `train`: it makes the network of the paper's size with random weights, whose speed is that of
-any others.
 `satellite_01` is a shipped model or a folder with keypoints.onnx (or direct.onnx) and locator.onnx. Each figure is the
-median of `--runs` calls on one thread setting, after a warm-up; the picture is noise, which costs the networks what any
-picture does. The pose solver is timed on the projected keypoints with noise, since noise alone has no pose.
+median of `--runs` calls on one thread setting, after a warm-up. The image is noise, which costs the networks what any
+image does. The pose solver is timed on projected keypoints with noise, since noise alone has no pose.
+
+--peers needs the extra `train`. It exports networks of the published sizes with random weights, whose speed is that of
+any others, and runs all networks in turns, so that a busy machine slows all of them alike.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import cache
 
 import numpy as np
-import onnxruntime
 from numpy import ndarray
 from rich.console import Console
 from rich.table import Table
 
-from gknet.errors import ends_in_one_line
+from gknet.errors import GknetError, ends_in_one_line
 from gknet.frame import Box, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
@@ -32,9 +31,20 @@ from gknet.inference.direct_estimator import DirectEstimator, decode_output
 from gknet.inference.keypoint_estimator import KeypointEstimator
 from gknet.inference.load import load_estimator
 from gknet.inference.network_io import network_input
+from gknet.inference.onnx_session import open_session
 from gknet.inference.pnp import solve_pnp
 
 CAMERA = Camera.from_focal(1400, 1024, 1024)
+THREADS = (1, 2)
+PEERS = {
+    "GKNet, the paper's size": "gknet-paper",
+    "HRNet-W32": "hrnet",
+    "ResUNet-34": "resunet",
+    "DMANet": "dmanet",
+}
+
+
+PEER_SIZE = 256
 
 
 def median_ms(call: Callable[[], object], runs: int) -> float:
@@ -53,15 +63,18 @@ def stages(estimator: KeypointEstimator | DirectEstimator, runs: int) -> dict[st
     image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
     crop = Crop(200, 200, 600, estimator.settings.input_size)
     given = network_input(image, crop)
-    look = direct_stages if isinstance(estimator, DirectEstimator) else keypoint_stages
-    found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs), **look(estimator, given, crop, runs)}
+    if isinstance(estimator, DirectEstimator):
+        further = direct_stages(estimator, given, crop, runs)
+    else:
+        further = keypoint_stages(estimator, given, crop, runs)
+    found = {"cut the crop": median_ms(lambda: network_input(image, crop), runs), **further}
     whole = sum(found.values())
     if estimator.locator is not None:
         found["locate (whole frame)"] = median_ms(lambda: estimator.locate(image), runs)
         whole += found["locate (whole frame)"]
     found["frame to pose"] = whole
     if isinstance(estimator, KeypointEstimator):
-        found["pose without the box's say"] = keypoint_stages(estimator, given, crop, runs, False)["pose"]
+        found["pose without the box"] = keypoint_stages(estimator, given, crop, runs, False)["pose"]
     return found
 
 
@@ -87,9 +100,10 @@ def keypoint_stages(
 
 
 def direct_stages(estimator: DirectEstimator, given: ndarray, crop: Crop, runs: int) -> dict[str, float]:
-    """From the crop to a pose that the network tells."""
+    """From the crop to a pose by direct regression."""
     output = estimator.network(given)[0]
     shown = decode_output(output, estimator.bins)
+    assert shown is not None  # the weights are finite
     return {
         "direct network": median_ms(lambda: estimator.network(given), runs),
         "decode": median_ms(lambda: decode_output(output, estimator.bins), runs),
@@ -97,52 +111,67 @@ def direct_stages(estimator: DirectEstimator, given: ndarray, crop: Crop, runs: 
     }
 
 
-def write_paper_network(path: Path) -> None:
-    """gknet-paper for 16 keypoints on a chain, as an export would have it."""
-    import onnx
+@cache
+def exported(name: str) -> bytes:
+    """A network of the list for 16 keypoints on a chain, with random weights, as an export would have it."""
     import torch
 
     from gknet.network.build import build
     from gknet.training.onnx_graph import onnx_graph
 
     chain = np.eye(16, dtype=bool) | np.eye(16, k=1, dtype=bool) | np.eye(16, k=-1, dtype=bool)
-    network = build("gknet-paper", chain, np.zeros((16, 3))).eval()
-    onnx.save(onnx_graph(network, torch.zeros(2, 3, 256, 256)), path)
+    points_m = np.random.default_rng(0).normal(size=(16, 3))
+    network = build(name, chain, points_m).eval()
+    return onnx_graph(network, torch.zeros(2, 3, PEER_SIZE, PEER_SIZE)).SerializeToString()
 
 
-def paper_ms(path: Path, threads: int, runs: int) -> float:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    given = np.random.default_rng(0).random((1, 3, 256, 256), dtype=np.float32)
-    return median_ms(lambda: session.run(None, {"image": given}), max(3, runs // 10))
+def networks_in_turns(estimator: KeypointEstimator, threads: int, runs: int) -> dict[str, float]:
+    """Median milliseconds of a crop: the estimator's network and the peers, one call of each after the other."""
+    size = estimator.settings.input_size
+    ours = np.random.default_rng(0).random((1, 3, size, size), dtype=np.float32)
+    theirs = np.random.default_rng(0).random((1, 3, PEER_SIZE, PEER_SIZE), dtype=np.float32)
+
+    def call_of(model: bytes) -> Callable[[], object]:
+        session = open_session(model, threads)
+        return lambda: session.run(None, {"image": theirs})
+
+    calls: dict[str, Callable[[], object]] = {f"this model, {size} px": lambda: estimator.keypoint_network(ours)}
+    calls |= {f"{words}, {PEER_SIZE} px": call_of(exported(name)) for words, name in PEERS.items()}
+    times: dict[str, list[float]] = {words: [] for words in calls}
+    for _ in range(runs):
+        for words, call in calls.items():
+            start = time.perf_counter()
+            call()
+            times[words].append(time.perf_counter() - start)
+    return {words: 1000 * float(np.median(found[1:] or found)) for words, found in times.items()}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="a shipped model's name or a folder with keypoints.onnx or direct.onnx")
-    parser.add_argument("--paper", action="store_true", help="time gknet-paper too, the unit of the ratios")
+    parser.add_argument("--peers", action="store_true", help="time networks of the published sizes too")
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--tta-rotations", type=int, default=1, help="orientations in which a crop is seen: 1, 2 or 4")
+    parser.add_argument("--tta-rotations", type=int, default=1, help="rotations of a crop that are averaged")
     chosen = parser.parse_args()
 
-    table = Table("stage", "threads", "ms", "of gknet-paper", title=f"inference, {chosen.model}")
-    paper_times: dict[int, float] = {}
-    if chosen.paper:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "gknet-paper.onnx"
-            write_paper_network(path)
-            paper_times = {threads: paper_ms(path, threads, chosen.runs) for threads in (1, 2)}
-    for threads in (1, 2):
-        paper = paper_times.get(threads)
-        for stage, ms in stages(
-            load_estimator(chosen.model, threads, tta_rotations=chosen.tta_rotations), chosen.runs
-        ).items():
-            table.add_row(stage, str(threads), f"{ms:.2f}", f"1/{paper / ms:.0f}" if paper else "-")
-        if paper:
-            table.add_row("gknet-paper's network", str(threads), f"{paper:.0f}", "1")
-        table.add_section()
+    table = Table("stage", *(f"ms, {threads} threads" for threads in THREADS), title=f"inference, {chosen.model}")
+    estimators = [load_estimator(chosen.model, threads, tta_rotations=chosen.tta_rotations) for threads in THREADS]
+    found = [stages(estimator, chosen.runs) for estimator in estimators]
+    for stage in found[0]:
+        table.add_row(stage, *(f"{each[stage]:.2f}" for each in found))
     Console().print(table)
+    if not chosen.peers:
+        return
+    peers = Table("network alone, a crop", *(f"ms, {threads} threads" for threads in THREADS), "of this model")
+    timed = []
+    for estimator, threads in zip(estimators, THREADS, strict=True):
+        if not isinstance(estimator, KeypointEstimator):
+            raise GknetError("--peers: expected a keypoint model")
+        timed.append(networks_in_turns(estimator, threads, max(5, chosen.runs // 5)))
+    first = next(iter(timed[0]))
+    for words in timed[0]:
+        peers.add_row(words, *(f"{each[words]:.1f}" for each in timed), f"{timed[-1][words] / timed[-1][first]:.1f}")
+    Console().print(peers)
 
 
 if __name__ == "__main__":

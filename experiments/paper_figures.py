@@ -34,7 +34,7 @@ from gknet.report.overlay import draw_overlay, zoomed
 from gknet.report.palette import SKY, WHITE
 from gknet.spacecraft import Spacecraft
 
-SIDE, MOVING_SIDE = 512, 320
+SIDE, DETECTION_SIDE, MOVING_SIDE = 512, 384, 320
 METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
 FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
@@ -76,7 +76,7 @@ def sheet(rows: list[list[ndarray]], gap: int = 8) -> ndarray:
 
 def write_jpeg(path: Path, image: ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+    write_bytes(path, cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])[1].tobytes())
     print(f"wrote {path}")
 
 
@@ -152,7 +152,7 @@ def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequ
         _, frame, estimates, rmse = found[len(found) // 2]
         row = []
         for method, estimate in estimates.items():
-            near, close = zoomed(frame, estimate, oracle_crop(frame, spacecraft, SIDE))
+            near, close = zoomed(frame, estimate, oracle_crop(frame, spacecraft, DETECTION_SIDE))
             words = [method, f"RMSE {rmse[method]:.1f} px"]
             row.append(draw_overlay(near, spacecraft, close, words, legend=False, weight=1.3))
         rows.append(row)
