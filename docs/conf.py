@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +11,10 @@ from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
+from typer.main import get_command
 
 import gknet
+from gknet.cli.main import app as gknet_app
 
 DOCS = Path(__file__).parent
 
@@ -38,6 +41,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 default_role = "code"
+smartquotes = False  # "--" begins an option: it is no dash
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 napoleon_numpy_docstring = False
@@ -66,13 +70,22 @@ def block_math(self: HTML5Translator, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def with_whole_summaries(text: str) -> str:
+    """The reference with the first sentence of each command in its list, which typer's tool cuts at 45 characters."""
+    for name, command in get_command(gknet_app).commands.items():  # type: ignore[attr-defined]
+        summary = " ".join((command.help or "").split("\n\n")[0].split())
+        text = re.sub(rf"^\* `{name}`: .*$", lambda _, n=name, s=summary: f"* `{n}`: {s}", text, flags=re.MULTILINE)
+    return text
+
+
 def write_command_reference(app: Sphinx) -> None:
     """reference/commands.md from the help texts of the command line, by typer's own tool."""
     target = DOCS / "reference" / "commands.md"
     tool = ["-m", "typer", "gknet.cli.main", "utils", "docs", "--name", "gknet", "--title", "Commands"]
     run = subprocess.run([sys.executable, *tool], capture_output=True, text=True, check=True)
     introduction = "Made from the help texts of the program: `gknet --help` and `gknet COMMAND --help` print the same."
-    text = run.stdout.replace("# Commands\n", f"# Commands\n\n{introduction}\n", 1)
+    text = run.stdout.replace("# Commands\n", f"# Commands\n\n{introduction}\n", 1).replace("&#x27;", "'")
+    text = with_whole_summaries(text)
     if not target.is_file() or target.read_text(encoding="utf-8") != text:
         target.write_text(text, encoding="utf-8")
 

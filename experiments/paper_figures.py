@@ -1,13 +1,11 @@
-"""Figure 2 of the paper (the keypoints of the spacecraft, and the dataset), figure 3 (detections by method), and
-the README's moving picture (estimates of the shipped models).
+"""The README's animation (estimates of the shipped models), and figure 3 of the paper (detections by method).
 
     python experiments/paper_figures.py --out docs/images
     python experiments/paper_figures.py --out docs/images --work runs/paper --scale cpu     # figure 3 too
 
 Hardware   any
 Time       seconds
-Expected   keypoints.jpg and overlays.webp from the bundled frames; detections.jpg from the models of
-           paper_tables.py
+Expected   overlays.webp from the bundled frames; detections.jpg from the models of paper_tables.py
 """
 
 from __future__ import annotations
@@ -26,13 +24,10 @@ from gknet.dataset.skd import SkdDataset
 from gknet.errors import GknetError, ends_in_one_line
 from gknet.evaluation.metrics import compute_errors, oracle_crop
 from gknet.fleet import NAMES
-from gknet.frame import Estimate, Failure, FailureKind, Frame
+from gknet.frame import Frame
 from gknet.inference.load import load_estimator
 from gknet.io.atomic import write_bytes
-from gknet.report.canvas import Canvas
 from gknet.report.overlay import draw_overlay, zoomed
-from gknet.report.palette import SKY, WHITE
-from gknet.spacecraft import Spacecraft
 
 SIDE, DETECTION_SIDE, MOVING_SIDE = 512, 384, 320
 METHODS = {"HRNet": "hrnet-xs", "ResUNet": "resunet-xs", "GKNet": "gknet-xs"}
@@ -40,36 +35,13 @@ FULL_METHODS = {"HRNet": "hrnet", "ResUNet": "resunet", "GKNet": "gknet-paper"}
 
 
 def image_of(frame: Frame) -> UInt8[ndarray, "h w 3"]:
-    """The picture of a frame that was read with it."""
+    """The image of a frame that was read with it."""
     assert frame.image is not None
     return frame.image
 
 
-def craft_close(frame: Frame, spacecraft: Spacecraft) -> Frame:
-    """The frame in its oracle crop."""
-    near, _ = zoomed(
-        frame, Estimate(failure=Failure(FailureKind.NO_SOLUTION, "not estimated")), oracle_crop(frame, spacecraft, SIDE)
-    )
-    return near
-
-
-def definition(frame: Frame, spacecraft: Spacecraft) -> ndarray:
-    """The true skeleton with a number at each keypoint."""
-    near = craft_close(frame, spacecraft)
-    canvas = Canvas(image_of(near).copy())
-    pixels = near.keypoints_px(spacecraft.points_m)
-    for i, j in spacecraft.edges:
-        canvas.line(pixels[i], pixels[j], SKY, 1.5)
-    for k, pixel in enumerate(pixels):
-        canvas.disc(pixel, SKY)
-        away = pixel - pixels.mean(axis=0)
-        canvas.label(str(k + 1), pixel + 26 * away / max(np.linalg.norm(away), 1e-9), WHITE, 26)
-    canvas.text(spacecraft.name, np.array([20.0, 40.0]), WHITE, 30)
-    return canvas.image
-
-
 def sheet(rows: list[list[ndarray]], gap: int = 8) -> ndarray:
-    """Pictures of one size in rows, white between them."""
+    """Images of one size in rows, white between them."""
     edged = [[np.pad(picture, ((0, gap), (0, gap), (0, 0)), constant_values=255) for picture in row] for row in rows]
     return np.concatenate([np.concatenate(row, axis=1) for row in edged])
 
@@ -78,26 +50,6 @@ def write_jpeg(path: Path, image: ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])[1].tobytes())
     print(f"wrote {path}")
-
-
-def visible_and_near(frame: Frame) -> tuple[int, float]:
-    """How well a frame shows its spacecraft: the visible keypoints, then the nearness."""
-    assert frame.visible is not None
-    assert frame.range_m is not None
-    return int(frame.visible.sum()), -frame.range_m
-
-
-def keypoint_figure() -> ndarray:
-    """A row of definitions and two rows of whole frames."""
-    rows: list[list[ndarray]] = [[], [], []]
-    for name in NAMES:
-        dataset = SkdDataset(bundled_frames(), None, name)
-        frames = [dataset.frame(i) for i in range(len(dataset))]
-        best = max(frames, key=visible_and_near)
-        rows[0].append(definition(best, dataset.spacecraft))
-        for row, frame in zip(rows[1:], (frames[0], frames[-1]), strict=True):
-            row.append(cv2.resize(image_of(frame), (SIDE, SIDE), interpolation=cv2.INTER_AREA))
-    return sheet(rows)
 
 
 def overlay_figures() -> list[ndarray]:
@@ -161,12 +113,11 @@ def detection_figure(work: Path, methods: dict[str, str], spacecraft_names: Sequ
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the images")
     parser.add_argument("--work", type=Path, help="work folder of experiments/paper_tables.py")
     parser.add_argument("--scale", default="cpu", help="its sub-folder")
     parser.add_argument("--spacecraft", nargs="+", choices=NAMES, default=list(NAMES), help="the rows of figure 3")
     arguments = parser.parse_args()
-    write_jpeg(arguments.out / "keypoints.jpg", keypoint_figure())
     write_moving(arguments.out / "overlays.webp", overlay_figures())
     if arguments.work is not None:
         methods = FULL_METHODS if arguments.scale == "full" else METHODS

@@ -28,6 +28,8 @@ PROTOCOLS = {
     "detected crop, 4 rotations": ("detected", "_tta4"),
 }
 """Column -> the protocol in a file of figures, and the end of the file's name."""
+SHORT = {"oracle crop": "oracle", "detected crop": "detected", "detected crop, 4 rotations": "detected, TTA"}
+"""Column -> what a narrow table calls it."""
 COLUMNS = {
     "rmse_px": "RMSE px",
     "rmse_hidden_px": "RMSE hidden px",
@@ -49,30 +51,35 @@ def figures(results: Path, name: str, recipe: str, words: str = "oracle crop") -
         raise GknetError(f"{path}: not the figures of experiments/shipped_models.py ({error})") from error
 
 
+def digits(value: float) -> str:
+    """Three significant digits, zeros at the end kept: 0.05 is 0.0500."""
+    return f"{value:#.3g}".removesuffix(".")
+
+
+def mean_median(found: dict[str, Any]) -> str:
+    """Mean (median) of a metric."""
+    return f"{digits(found['mean'])} ({digits(found['median'])})"
+
+
 def statistic(run: dict[str, Any], name: str) -> str:
-    """Mean [95 % interval], median."""
+    """Mean (median) [95 % interval of the mean]."""
     found = run["metrics"].get(name)
     if found is None:
         return ""
-    return f"{found['mean']:.3g} [{found['low']:.3g}, {found['high']:.3g}], {found['median']:.3g}"
+    return f"{mean_median(found)} [{digits(found['low'])}, {digits(found['high'])}]"
 
 
 def table(results: Path, recipe: str) -> str:
-    """Markdown: mean, median of the headline figures; a row for each spacecraft and crop."""
+    """Markdown: mean (median) of the headline figures; a row for each spacecraft and crop."""
     shown = ("rmse_px", "rmse_hidden_px", "e_t", "e_q_rad")
-    lines = [
-        "| spacecraft, crop | frames | no pose | "
-        + " | ".join(COLUMNS[name] for name in shown)
-        + " | in 95 % | IoU >= 0.7 |",
-        "|---" * (len(shown) + 5) + "|",
-    ]
+    header = ["spacecraft", "crop", "no pose", *[COLUMNS[name] for name in shown], "in 95 %", "IoU >= 0.7"]
+    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
     for name in NAMES:
         for words in PROTOCOLS:
             run = figures(results, name, recipe, words)
             located = "" if words == "oracle crop" else f"{100 * run['located_07']:.1f} %"
-            pairs = [(run["metrics"][column]["mean"], run["metrics"][column]["median"]) for column in shown]
-            cells = [f"{name}, {words}", str(run["frames"]), str(sum(run["failures"].values()))]
-            cells += [f"{mean:.3g}, {median:.3g}" for mean, median in pairs]
+            cells = [name, SHORT[words], f"{sum(run['failures'].values())} of {run['frames']}"]
+            cells += [mean_median(run["metrics"][column]) for column in shown]
             lines.append("| " + " | ".join([*cells, f"{100 * run['coverage_95']:.0f} %", located]) + " |")
     return "\n".join(lines)
 
@@ -80,15 +87,15 @@ def table(results: Path, recipe: str) -> str:
 def binned_table(
     results: Path, names: Sequence[str], recipe: str, words: str, by: str, metric: str, columns: dict[float, str]
 ) -> str:
-    """Markdown: mean, median of a metric in the bins by a condition; `columns` are their lower ends and names."""
-    header = [f"spacecraft, {words}", *[f"{column}, frames: {COLUMNS[metric]}" for column in columns.values()]]
+    """Markdown: frames, and mean (median) of a metric, by a condition; `columns` are lower ends of bins and names."""
+    header = ["spacecraft", *columns.values()]
     lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
     for name in names:
         bins = {b["low"]: b for b in figures(results, name, recipe, words)["bins"] if b["by"] == by}
         cells = [name]
         for low in columns:
             found = bins[low]["metrics"][metric] if low in bins else None
-            cells.append("none" if found is None else f"{found['frames']}: {found['mean']:.3g}, {found['median']:.3g}")
+            cells.append("none" if found is None else f"{found['frames']}: {mean_median(found)}")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -101,7 +108,7 @@ def background_table(results: Path, names: Sequence[str], recipe: str) -> str:
 
 def confidence_table(results: Path, names: Sequence[str], recipe: str) -> str:
     """E_q of the detected crop, by the confidence in the attitude."""
-    columns = {0.0: "confidence below .5", 0.5: ".5 to .8", 0.8: ".8 to .95", 0.95: "above"}
+    columns = {0.0: "below .5", 0.5: ".5 to .8", 0.8: ".8 to .95", 0.95: ".95 and more"}
     return binned_table(results, names, recipe, "detected crop", "attitude_confidence", "e_q_rad", columns)
 
 
@@ -115,6 +122,12 @@ def validated(path: Path) -> dict[str, Any]:
     return about
 
 
+VALIDATION = (
+    "",
+    "The validation sequences are neither trained on nor tested; keypoints are validated with the oracle crop. `score`",
+    "decides which weights are kept (lower is better). `share` is the share of the last training in the weights, which",
+    "are the mean of those before and after it. The documentation (training, logged values) explains the others.",
+)
 LIMITS = (
     "",
     "## Limits",
@@ -123,7 +136,8 @@ LIMITS = (
     "- The models are made for spacecraft that span 8 to 90 % of a 1024 px frame. Another camera works through its",
     "  matrix; a span far outside that range does not.",
     "- Where symmetric parts look the same, the attitude can be wrong although the reprojection error is small.",
-    "  `attitude_confidence` measures how likely that is; the table above shows how well.",
+    "  A low `attitude_confidence` reveals a part of such poses; the table above shows how large a part.",
+    "- The models know this spacecraft alone. An image of another one can get a confident wrong pose.",
     "- Test frames decided three rules of the pose solver (decision 0014 of the documentation).",
     "- Weights are stored in 16 bits.",
     "",
@@ -140,24 +154,27 @@ def card(models: Path, results: Path, name: str) -> str:
         "Keypoint errors are in pixels of the 256 px crop. E_t is the error of the position relative to the range.",
         "",
     ]
-    lines += ["| network | input px | file | best validation |", "|---|---|---|---|"]
+    lines += ["| network | input px | file | validation of these weights |", "|---|---|---|---|"]
     for kind in ("keypoints", "locator"):
         path = models / name / f"{kind}.onnx"
         about = validated(path)
         best = ", ".join(f"{key} {value:.3g}" for key, value in about["validation"].items())
         size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
         lines.append(f"| {about['network']} | {about['input_size']} | {size} | {best} |")
+    lines += VALIDATION
     for recipe in ("skd", "skd-hard"):
         runs = [figures(results, name, recipe, words) for words in PROTOCOLS]
-        lines += ["", f"## {recipe}, test sequences: mean [95 % interval over sequences], median", ""]
+        lines += ["", f"## {recipe}, test sequences: mean (median) [95 % interval of the mean, over sequences]", ""]
         lines += ["| | " + " | ".join(PROTOCOLS) + " |", "|---" * (1 + len(PROTOCOLS)) + "|"]
         for column, words in COLUMNS.items():
             cells = [statistic(run, column) for run in runs]
             lines.append(f"| {words} | " + " | ".join(cells) + " |")
         covered = [f"{100 * run['coverage_95']:.0f} %" for run in runs]
         lines.append("| true poses in the 95 % ellipsoid | " + " | ".join(covered) + " |")
-    lines += ["", "## skd, by background and by attitude_confidence: mean, median", ""]
-    lines += [background_table(results, (name,), "skd"), "", confidence_table(results, (name,), "skd"), *LIMITS]
+    lines += ["", "## skd, by background, oracle crop: frames, RMSE px as mean (median)", ""]
+    lines += [background_table(results, (name,), "skd")]
+    lines += ["", "## skd, by attitude_confidence, detected crop: frames, E_q rad as mean (median)", ""]
+    lines += [confidence_table(results, (name,), "skd"), *LIMITS]
     return "\n".join(lines) + "\n"
 
 
@@ -169,9 +186,10 @@ def main() -> None:
     for name in NAMES:
         write_text(arguments.models / name / "README.md", card(arguments.models, arguments.results, name))
     for recipe in ("skd", "skd-hard"):
-        print(f"\n{recipe}: mean, median\n\n{table(arguments.results, recipe)}")
-        print(f"\n{recipe}, by background\n\n{background_table(arguments.results, NAMES, recipe)}")
-        print(f"\n{recipe}, by attitude_confidence\n\n{confidence_table(arguments.results, NAMES, recipe)}")
+        print(f"\n{recipe}: mean (median)\n\n{table(arguments.results, recipe)}")
+        print(f"\n{recipe}, by background: frames, RMSE px\n\n{background_table(arguments.results, NAMES, recipe)}")
+        confidence = confidence_table(arguments.results, NAMES, recipe)
+        print(f"\n{recipe}, by attitude_confidence: frames, E_q rad\n\n{confidence}")
 
 
 if __name__ == "__main__":

@@ -33,3 +33,11 @@ def test_paper_comparison(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     (tmp_path / "experiments").symlink_to(ROOT / "experiments")
     assert "GKNet" in read("tutorials/paper-comparison.md", tmp_path)
+
+
+@pytest.mark.slow
+def test_own_spacecraft(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba")
+    pytest.importorskip("torch")
+    read("howto/own-spacecraft.md", tmp_path)
+    assert {path.name for path in (tmp_path / "models" / "mysat").glob("*.onnx")} == {"keypoints.onnx", "locator.onnx"}
