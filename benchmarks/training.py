@@ -29,10 +29,11 @@ from gknet.network.build import build
 from gknet.spacecraft import Spacecraft
 from gknet.training.batch import Batch, Loader
 from gknet.training.cache import Cache
+from gknet.training.learner import update_average
 from gknet.training.optimizer import make_optimizer
 from gknet.training.schedule import Stage
 from gknet.training.settings import TrainSettings
-from gknet.training.setup import cpu_has_bf16, make_task, open_cache, update_average
+from gknet.training.setup import cpu_has_bf16, make_task, open_cache
 
 ROUNDS = 4
 
@@ -49,7 +50,8 @@ def noise_cache(spacecraft: Spacecraft, count: int = 512, size: int = 320) -> Ca
 def stepper(network_name: str, spacecraft: Spacecraft, averaged: bool) -> Callable[[Batch], None]:
     """One training step on a batch; with averaging and clipping when it is the real loop's."""
     settings = TrainSettings(network_name, epochs=1)
-    network = build(network_name, spacecraft.adjacency, spacecraft.points_m).to(memory_format=torch.channels_last)
+    network = build(network_name, spacecraft.adjacency, spacecraft.points_m)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
     task, optimizer, device = (
         make_task(network, spacecraft, settings),
