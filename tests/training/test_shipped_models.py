@@ -69,9 +69,10 @@ def test_a_mean_goes_from_the_old_weights_to_the_new(recipe: ModuleType) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
     scale = replace(
-        recipe.SCALES["cpu"], first_minutes=0.05, keypoint_minutes=(0.05,), locator_minutes=0.05, stages=STAGES
+        recipe.SCALES["cpu"], first_minutes=0.01, keypoint_minutes=(0.01,), locator_minutes=0.01, stages=STAGES
     )
     recipe.train_all(work, scale, None, SEED)
     recipe.ship(work, work / "models", None)
@@ -96,9 +97,10 @@ def test_it_trains_blends_and_exports(recipe: ModuleType, work: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_weights_of_another_network_give_what_fits_and_make_no_mean(recipe: ModuleType, work: Path) -> None:
     """And a locator that is kept ships as it was, neither rendered for nor trained."""
-    scale = replace(recipe.SCALES["cpu"], keypoint_minutes=(0.05,), stages=STAGES)
+    scale = replace(recipe.SCALES["cpu"], keypoint_minutes=(0.01,), stages=STAGES)
     start = work / "start"
     (start / CRAFT).mkdir(parents=True)
     (start / CRAFT / "locator.onnx").write_bytes(b"as it was")
