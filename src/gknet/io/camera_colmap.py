@@ -11,7 +11,7 @@ import numpy as np
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera, LensModel
-from gknet.io.calibration import calibration, matrix_of, numbers
+from gknet.io.camera_values import camera_from_values, matrix_of, numbers
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import quoted
 
@@ -52,4 +52,4 @@ def from_colmap(source: object, text: str) -> Camera | MatrixOnly:
     matrix = matrix_of(source, [fx_fy[0], fx_fy[-1], *centre])
     width, height = numbers(source, "size", words[2:4], (2,))
     bent = np.pad(distortion, (0, max(0, 4 - len(distortion))))
-    return calibration(source, matrix, bent, (float(width), float(height)), model)
+    return camera_from_values(source, matrix, bent, (float(width), float(height)), model)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera
-from gknet.io.calibration import CENTRE_AT_INTEGER, calibration, matrix_of, required
 from gknet.io.camera_opencv import from_storage, is_storage
+from gknet.io.camera_values import CENTRE_AT_INTEGER, camera_from_values, matrix_of, required
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import quoted
 
@@ -29,7 +29,7 @@ def from_json(source: object, content: object) -> Camera | MatrixOnly:
     if "fx" in content:
         *focal_and_centre, width, height = required(source, content, *_BOP)
         matrix = matrix_of(source, focal_and_centre)
-        return calibration(source, matrix, None, (width, height), centre_shift_px=CENTRE_AT_INTEGER)
+        return camera_from_values(source, matrix, None, (width, height), centre_shift_px=CENTRE_AT_INTEGER)
     return _from_ours(source, content)
 
 
@@ -43,11 +43,11 @@ def _from_ours(source: object, content: dict[str, object]) -> Camera | MatrixOnl
     if model not in ("pinhole", "fisheye"):
         raise GknetError(f"{source}: model: expected 'pinhole' or 'fisheye', got {quoted(model)}")
     size = content["width"], content["height"]
-    return calibration(source, content["matrix"], content.get("distortion"), size, model)
+    return camera_from_values(source, content["matrix"], content.get("distortion"), size, model)
 
 
 def _from_speed_plus(source: object, content: dict[str, object]) -> Camera | MatrixOnly:
     missing = {"Nu", "Nv", "distCoeffs"} - set(content)
     if missing:
         raise GknetError(f"{source}: missing {', '.join(sorted(missing))} beside cameraMatrix")
-    return calibration(source, content["cameraMatrix"], content["distCoeffs"], (content["Nu"], content["Nv"]))
+    return camera_from_values(source, content["cameraMatrix"], content["distCoeffs"], (content["Nu"], content["Nv"]))

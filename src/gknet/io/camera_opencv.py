@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera
-from gknet.io.calibration import CENTRE_AT_INTEGER, calibration, numbers, whole
+from gknet.io.camera_values import CENTRE_AT_INTEGER, camera_from_values, numbers, whole
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import quoted
 
@@ -42,7 +42,7 @@ def from_storage(source: object, content: Mapping[str, object]) -> Camera | Matr
         found = ", ".join(quoted(key)[1:-1] for key in list(content)[:10])
         raise GknetError(f"{source}: expected camera_matrix, as OpenCV's calibration sample writes it, got {found}")
     fisheye = values.get("fisheyemodel") in (1, "1", True) or values.get("model") == "fisheye"
-    return calibration(
+    return camera_from_values(
         source,
         _matrix(source, "camera_matrix", matrix).reshape(3, 3),
         None if distortion is None else _matrix(source, "distortion_coefficients", distortion, None),

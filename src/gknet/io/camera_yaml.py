@@ -12,8 +12,8 @@ import yaml
 
 from gknet.errors import GknetError
 from gknet.geometry import Camera, LensModel
-from gknet.io.calibration import CENTRE_AT_INTEGER, calibration, matrix_of, numbers, required
 from gknet.io.camera_opencv import from_storage, is_storage
+from gknet.io.camera_values import CENTRE_AT_INTEGER, camera_from_values, matrix_of, numbers, required
 from gknet.io.lens import MatrixOnly
 from gknet.io.text import quoted
 
@@ -83,7 +83,7 @@ def _from_ros(source: object, content: dict[Any, Any]) -> Camera | MatrixOnly:
     nine = numbers(source, "camera_matrix", _data(matrix), None)
     if len(nine) != 9:
         raise GknetError(f"{source}: camera_matrix: expected 9 numbers, got {len(nine)}")
-    return calibration(source, nine.reshape(3, 3), coefficients, (width, height), model, CENTRE_AT_INTEGER)
+    return camera_from_values(source, nine.reshape(3, 3), coefficients, (width, height), model, CENTRE_AT_INTEGER)
 
 
 def _data(value: object) -> object:
@@ -119,4 +119,6 @@ def _from_kalibr(source: object, content: dict[Any, Any]) -> Camera | MatrixOnly
         raise GknetError(f"{source}: distortion_model: expected {', '.join(_KALIBR_MODELS)}, got {quoted(distortion)}")
     width, height = (float(number) for number in numbers(source, "resolution", size, (2,)))
     matrix, coefficients = matrix_of(source, intrinsics), camera.get("distortion_coeffs")
-    return calibration(source, matrix, coefficients, (width, height), _KALIBR_MODELS[distortion], CENTRE_AT_INTEGER)
+    return camera_from_values(
+        source, matrix, coefficients, (width, height), _KALIBR_MODELS[distortion], CENTRE_AT_INTEGER
+    )

@@ -17,7 +17,7 @@ CENTRE_AT_INTEGER = 0.5
 """Added to a principal point of a convention in which the centre of the top-left pixel is (0, 0)."""
 
 
-def calibration(
+def camera_from_values(
     source: object,
     matrix: object,
     distortion: object,
