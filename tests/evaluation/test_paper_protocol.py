@@ -9,7 +9,7 @@ from gknet.errors import GknetError
 from gknet.evaluation.metrics import pose_errors
 from gknet.evaluation.paper_protocol import PaperEstimator, highest_cells, plain_pnp
 from gknet.frame import Box
-from gknet.geometry import Camera, Pose
+from gknet.geometry import Camera, LensModel, Pose
 from gknet.inference.network_io import NetworkOutput
 from gknet.spacecraft import Spacecraft
 
@@ -44,6 +44,29 @@ def test_plain_pnp_is_exact_on_exact_points_and_has_no_defence() -> None:
     pixels[4] += 150
     spoilt = plain_pnp(pixels, CAMERA, POINTS)
     assert max(pose_errors(POSE, spoilt)) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"), [("fisheye", (0.05, -0.02, 0.0, 0.0)), ("pinhole", (-0.3, 0.1, 0.0, 0.0, 0.0))]
+)
+def test_plain_pnp_is_exact_through_a_distorted_lens(model: LensModel, distortion: tuple[float, ...]) -> None:
+    camera = Camera(np.array([[500.0, 0, 400], [0, 500, 320], [0, 0, 1]]), 800, 640, np.array(distortion), model)
+    pose = Pose.from_quaternion([0.4, 0.2, -0.6, 0.3], [2.5, -1.3, 6])
+    found = plain_pnp(camera.project(pose.transform(POINTS)), camera, POINTS)
+    assert found is not None
+    assert max(pose_errors(pose, found)) < 1e-4
+
+
+def test_rays_that_no_pinhole_camera_has_are_left_out() -> None:
+    camera = Camera(np.array([[200.0, 0, 400], [0, 200, 400], [0, 0, 1]]), 800, 800, np.zeros(4), "fisheye")
+    pose = Pose.from_quaternion([0.4, 0.2, -0.6, 0.3], [0.5, -0.3, 8])
+    pixels = camera.project(pose.transform(POINTS))
+    pixels[3] = 740, 400  # 97 degrees from the axis
+    found = plain_pnp(pixels, camera, POINTS)
+    assert found is not None
+    assert max(pose_errors(pose, found)) < 1e-4
+    pixels[3:] = 740, 400
+    assert plain_pnp(pixels, camera, POINTS) is None
 
 
 def test_the_estimate_comes_from_the_given_crop() -> None:

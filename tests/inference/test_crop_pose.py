@@ -45,7 +45,8 @@ def poses_in_view(draw: st.DrawFn, camera: Camera) -> Pose:
     return Pose.from_quaternion(draw(quaternions()), draw(st.floats(2, 300)) * ray)
 
 
-def same(first: Pose, second: Pose, relative: float = 1e-6) -> None:
+def same(first: Pose | None, second: Pose, relative: float = 1e-6) -> None:
+    assert first is not None
     assert first.angle_to(second) < 1e-6
     np.testing.assert_allclose(
         first.translation_m, second.translation_m, atol=relative * float(np.linalg.norm(second.translation_m))
@@ -59,6 +60,15 @@ def test_a_pose_and_back(data: st.DataObject, camera: Camera, crop: Crop) -> Non
     assert shown is not None
     same(shown.pose(camera, crop, 5.0), pose)
     same(CropPose.from_vector(shown.vector).pose(camera, crop, 5.0), pose)
+
+
+def test_a_pixel_that_no_ray_in_front_reaches_has_no_pose() -> None:
+    fisheye = Camera(np.array([[200.0, 0, 400], [0, 200, 400], [0, 0, 1]]), 800, 800, np.zeros(4), "fisheye")
+    crop = Crop(300, 300, 200, 256)
+    ahead = CropPose(np.array([0.5, 0.0]), 0.0, np.array([1.0, 0, 0, 0]))
+    aside = CropPose(np.array([1.7, 0.0]), 0.0, np.array([1.0, 0, 0, 0]))  # 340 px of 200 px per radian: 97 degrees
+    assert ahead.pose(fisheye, crop, 5.0) is not None
+    assert aside.pose(fisheye, crop, 5.0) is None
 
 
 def test_the_numbers_mean_what_the_module_states() -> None:
@@ -109,6 +119,7 @@ def test_a_turned_picture_shows_the_pose_of_a_rolled_camera(
     roll = Rotation.from_rotvec([0, 0, angle]).as_matrix()
     rolled = Camera(whole @ roll.T, 128, 128)
     found = warped.pose(rolled, Crop(0, 0, 128, 128), 5.0)
+    assert found is not None
     same(found, Pose(roll @ pose.rotation, roll @ pose.translation_m))
     near = 0.02 * POINTS
     pixels = camera.project(pose.transform(near))

@@ -7,7 +7,7 @@ import pytest
 
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import compute_errors
-from gknet.frame import FailureKind, Frame
+from gknet.frame import Box, FailureKind, Frame
 from gknet.geometry import Camera, Pose
 from gknet.inference.attitude import AttitudeBins
 from gknet.inference.crop import Crop
@@ -73,6 +73,18 @@ def test_answers_that_cannot_be_are_failures(place: int, value: float, kind: Fai
     assert estimate.cam_from_body is None
     assert estimate.failure is not None
     assert estimate.failure.kind == kind
+
+
+def test_a_place_that_no_ray_in_front_reaches_is_a_failure() -> None:
+    """At the rim of a fisheye's image."""
+    camera = Camera(np.array([[200.0, 0, 400], [0, 200, 400], [0, 0, 1]]), 800, 800, np.zeros(4), "fisheye")
+    output = output_of(CropPose(np.array([0.4, 0.0]), 0.0, np.array([1.0, 0, 0, 0])))
+    estimate = DirectEstimator(lambda images: output[None], CRAFT, BINS).estimate(
+        np.zeros((800, 800, 3), np.uint8), camera, Box(600, 300, 790, 500)
+    )
+    assert estimate.cam_from_body is None
+    assert estimate.failure is not None
+    assert estimate.failure.kind == FailureKind.BEHIND_CAMERA
 
 
 def test_bad_use_is_refused() -> None:

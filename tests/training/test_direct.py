@@ -102,6 +102,7 @@ def test_the_pose_of_a_sample_puts_the_keypoints_where_they_are(seed: int) -> No
         rolled, Crop(0, 0, INPUT_SIZE, INPUT_SIZE), CRAFT.diameter_m
     )
     seen = sample.weight > 0
+    assert told is not None
     assert seen.sum() >= 8
     np.testing.assert_allclose(rolled.project(told.transform(POINTS))[seen], sample.points_px[seen], atol=1e-3)
 

@@ -96,17 +96,20 @@ def plain_pnp(pixels: Float[ndarray, "n 2"], camera: Camera, points_m: Float[nda
 
     Args:
         pixels: (n, 2) in the image.
-        camera: The camera of the image, a pinhole.
+        camera: The camera of the image. Of a distorted one the pixels are undistorted first.
         points_m: (n, 3) in the body frame.
 
     Returns:
         cam_from_body, or None when OpenCV's solver finds none.
     """
+    ideal = camera.undistort(pixels)
+    finite = np.isfinite(ideal).all(axis=1)  # a fisheye has rays that no pinhole camera has
+    ideal, points_m = ideal[finite], points_m[finite]
     try:
-        found, turn, shift = cv2.solvePnP(points_m, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_EPNP)
+        found, turn, shift = cv2.solvePnP(points_m, ideal, camera.matrix, None, flags=cv2.SOLVEPNP_EPNP)
         if not found:
             return None
-        turn, shift = cv2.solvePnPRefineLM(points_m, pixels, camera.matrix, camera.distortion, turn, shift)
+        turn, shift = cv2.solvePnPRefineLM(points_m, ideal, camera.matrix, None, turn, shift)
     except cv2.error:
         return None
     if not (np.isfinite(turn).all() and np.isfinite(shift).all()):

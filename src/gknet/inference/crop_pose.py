@@ -67,15 +67,20 @@ class CropPose:
         offset = crop.to_input(pixel) / crop.size - 0.5
         return CropPose(offset, math.log(size_m / diameter_m), allocentric_wxyz(pose))
 
-    def pose(self, camera: Camera, crop: Crop, diameter_m: float) -> Pose:
+    def pose(self, camera: Camera, crop: Crop, diameter_m: float) -> Pose | None:
         """The pose cam_from_body that the crop shows: the inverse of `of`.
 
         Args:
             camera: The camera of the full image.
             crop: The crop of the image.
             diameter_m: Of the spacecraft.
+
+        Returns:
+            None when no ray in front of the camera reaches the origin's pixel, as at the rim of a fisheye's image.
         """
         pixel = camera.undistort(crop.to_image((self.offset + 0.5) * crop.size)[None])[0]
+        if not np.isfinite(pixel).all():
+            return None
         depth_m = math.exp(self.log_depth) * diameter_m * focal_px(camera) / crop.side
         ray = np.linalg.solve(camera.matrix, np.append(pixel, 1.0))
         attitude = Pose.from_quaternion(self.attitude_wxyz, np.zeros(3))

@@ -70,6 +70,9 @@ class DirectEstimator(CropEstimator):
         if crop_pose is None:
             return Estimate(box=box, failure=Failure(FailureKind.NOT_FINITE, "the network's output is not finite"))
         pose = crop_pose.pose(camera, crop, self.spacecraft.diameter_m)
+        if pose is None:
+            detail = "the network puts the spacecraft 90 degrees or more from the optical axis"
+            return Estimate(box=box, failure=Failure(FailureKind.BEHIND_CAMERA, detail))
         contradiction = self.contradiction(pose, camera, crop)
         if contradiction is not None:
             return Estimate(box=box, failure=contradiction)
