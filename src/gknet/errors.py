@@ -22,12 +22,17 @@ class MissingExtraError(GknetError):
     """An optional part of gknet is needed that is not installed.
 
     Args:
-        extra: Name of the extra, as in `pip install 'gknet[extra]'`.
+        extra: Name of the extra.
         module: What could not be imported.
     """
 
     def __init__(self, extra: str, module: str) -> None:
-        super().__init__(f"this needs the module '{module}': pip install 'gknet[{extra}]'")
+        super().__init__(f"this needs the module '{module}': {install_words(extra)}")
+
+
+def install_words(extra: str) -> str:
+    """How an extra is installed, in a clone of the repository and elsewhere."""
+    return f"install the extra '{extra}': pip install '.[{extra}]' in a clone, else pip install 'gknet[{extra}]'"
 
 
 @contextmanager

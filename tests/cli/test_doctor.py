@@ -71,7 +71,7 @@ def test_a_missing_extra_is_a_note_with_its_remedy(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(doctor, "_versions", lambda packages: ({}, list(packages)))
     finding = doctor._extra("train")
     assert (finding.status, finding.words) == (CheckStatus.note, "not installed")
-    assert "gknet[train]" in finding.remedy
+    assert "pip install '.[train]' in a clone, else pip install 'gknet[train]'" in finding.remedy
     assert doctor._renderer().status is CheckStatus.note
     assert doctor._core_libraries().status is CheckStatus.bad
 

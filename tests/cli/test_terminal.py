@@ -100,6 +100,17 @@ def test_help_keeps_square_brackets(
     assert words in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("command", "usage"), [("predict", "predict [OPTIONS] INPUT..."), ("eval", "eval [OPTIONS] DATA")]
+)
+def test_the_usage_line_is_that_of_other_programs(
+    command: str, usage: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run([command, "--help"]) == 0
+    assert f"Usage: gknet {usage}  " in capsys.readouterr().out
+
+
 def test_errors_show_no_control_character(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

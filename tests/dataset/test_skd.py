@@ -311,6 +311,23 @@ def test_another_spacecrafts_keypoints_are_refused(written: Written) -> None:
         _ = SkdDataset(root, spacecraft="satellite_01").spacecraft
 
 
+def test_a_split_without_the_spacecraft_is_named_with_what_there_is(written: Written) -> None:
+    root, _ = written
+    (root / "train.json").write_text('{"Satellite_01": []}')
+    (root / "val.json").write_text("{")
+    (root / "test.json").write_text('{"Satellite_01": ["data/000001"], "Satellite_02": ["data/000002"]}')
+    with pytest.raises(GknetError) as caught:
+        SkdDataset(root, "train", "satellite_01")
+    held = "test (Satellite_01, Satellite_02)"
+    assert str(caught.value) == f"{root}: no sequence of 'satellite_01' in the split 'train'; it has: {held}"
+    (root / "val.json").unlink()
+    with pytest.raises(GknetError, match=r"no sequence of 'satellite_07'; it has: test \(Satellite_01, Satellite_02\)"):
+        SkdDataset(root, None, "satellite_07")
+    (root / "train.json").unlink()
+    with pytest.raises(GknetError, match=r"expected train.json, found none; it has: test \(Satellite_01"):
+        SkdDataset(root, "train", "satellite_01")
+
+
 def test_missing_root_split_and_bad_arguments(tmp_path: Path) -> None:
     with pytest.raises(GknetError, match="no such dataset folder"):
         SkdDataset(tmp_path / "nowhere")

@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from gknet.cli.terminal import print_table
-from gknet.errors import GknetError
+from gknet.errors import GknetError, install_words
 from gknet.io.text import printable
 
 _CORE = (
@@ -107,7 +107,7 @@ def _core_libraries() -> Finding:
     found, missing = _versions(_CORE)
     words = ", ".join(f"{package} {number}" for package, number in found.items())
     if missing:
-        return Finding("core libraries", CheckStatus.bad, f"missing: {', '.join(missing)}", "pip install gknet")
+        return Finding("core libraries", CheckStatus.bad, f"missing: {', '.join(missing)}", "install gknet again")
     return Finding("core libraries", CheckStatus.good, words)
 
 
@@ -186,14 +186,14 @@ def _extra(extra: str) -> Finding:
     found, missing = _versions(_EXTRAS[extra])
     if missing:
         words = "not installed" if not found else f"missing: {', '.join(missing)}"
-        return Finding(f"extra {extra}", CheckStatus.note, words, f"pip install 'gknet[{extra}]'")
+        return Finding(f"extra {extra}", CheckStatus.note, words, install_words(extra))
     return Finding(f"extra {extra}", CheckStatus.good, ", ".join(f"{p} {v}" for p, v in found.items()))
 
 
 def _renderer() -> Finding:
     """Which of Mitsuba's variants a render would take."""
     if _versions(("mitsuba",))[1]:
-        return Finding("renderer", CheckStatus.note, "not installed", "pip install 'gknet[render]'")
+        return Finding("renderer", CheckStatus.note, "not installed", install_words("render"))
     try:
         from gknet.render.scene import choose_variant
 

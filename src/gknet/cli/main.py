@@ -41,14 +41,24 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("predict")(predict)
-app.command("eval")(evaluate)
-app.command("demo")(demo)
-app.command("doctor")(doctor)
-app.command("render")(render)
-app.command("train")(train)
-app.command("export")(export)
-app.command("fleet")(fleet)
+
+
+class _Command(typer.core.TyperCommand):
+    """A command whose usage line is that of other programs: "INPUT...", not "{INPUT}..."."""
+
+    def collect_usage_pieces(self, ctx: typer.Context) -> list[str]:
+        """The words of the usage line after the command's name."""
+        return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
+
+
+app.command("predict", cls=_Command)(predict)
+app.command("eval", cls=_Command)(evaluate)
+app.command("demo", cls=_Command)(demo)
+app.command("doctor", cls=_Command)(doctor)
+app.command("render", cls=_Command)(render)
+app.command("train", cls=_Command)(train)
+app.command("export", cls=_Command)(export)
+app.command("fleet", cls=_Command)(fleet)
 
 
 def _show_version(wanted: bool) -> None:
@@ -60,7 +70,7 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and leave.")
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     pass

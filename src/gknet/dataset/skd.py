@@ -77,8 +77,8 @@ class SkdDataset(Sequence[Frame]):
         if spacecraft is not None:
             chosen = spelled_as(spacecraft, self.categories)
             if chosen is None:
-                have = ", ".join(self.categories) or "none"
-                raise GknetError(f"{self.root}: no sequence of '{spacecraft}'; the spacecraft there are: {have}")
+                place = f" in the split '{split}'" if split else ""
+                raise GknetError(f"{self.root}: no sequence of '{spacecraft}'{place}; it has: {_holdings(self.root)}")
             listed = [(category, name) for category, name in listed if category == chosen]
             self.categories = (chosen,)
         self._sequences = [read_sequence(self.root, name, category) for category, name in listed]
@@ -201,15 +201,28 @@ def _listed_sequences(root: Path, split: str | None) -> list[tuple[str, str]]:
     except OSError as error:  # a folder above that may not be entered, a name that is too long
         raise GknetError(f"{root}: the dataset folder cannot be read ({error.strerror})") from error
     if not present:
-        raise GknetError(
-            f"{root}: expected {' or '.join(path.name for path in paths)}, found none; is it an SKD folder?"
-        )
+        held = _holdings(root)
+        remedy = f"it has: {held}" if held != "nothing" else "is it an SKD folder?"
+        raise GknetError(f"{root}: expected {' or '.join(path.name for path in paths)}, found none; {remedy}")
     listed = [item for path in present for item in _read_split(path)]
     names = [name for _, name in listed]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise GknetError(f"{root}: sequence '{twice}' is listed twice in {', '.join(path.name for path in present)}")
     return listed
+
+
+def _holdings(root: Path) -> str:
+    """The splits of a dataset and whose sequences they list, for a message: "train (A, B), test (A)"."""
+    words = []
+    for name in SPLITS:
+        try:
+            categories = sorted({category for category, _ in _read_split(root / f"{name}.json")})
+        except GknetError:  # absent or damaged
+            continue
+        if categories:
+            words.append(f"{name} ({', '.join(categories)})")
+    return ", ".join(words) or "nothing"
 
 
 def _read_split(path: Path) -> list[tuple[str, str]]:
@@ -278,7 +291,8 @@ def open_dataset(path: Path, spacecraft: Spacecraft, split: str | None, every: i
     """
     dataset = SkdDataset(path, split, spacecraft.name, every)
     if len(dataset) == 0:
-        raise GknetError(f"{path}: no frame of {spacecraft.name} in {f'the split {split}' if split else 'the dataset'}")
+        place = f"the split '{split}'" if split else "any split"
+        raise GknetError(f"{path}: no frame of '{spacecraft.name}' in {place}")
     points = dataset.spacecraft.points_m
     if points.shape != spacecraft.points_m.shape or np.abs(points - spacecraft.points_m).max() > SAME_POINT_M:
         raise GknetError(f"{path}: its {spacecraft.name} has other keypoints than the model's; train a model for it")
