@@ -86,7 +86,7 @@ def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
 def test_folder_goes_on_past_bad_pictures(
     use: Use, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    use(ToyEstimator(blind=frozenset({1}), doubted=frozenset({2})))
+    use(ToyEstimator(blind=frozenset({1}), ambiguous=frozenset({2})))
     data = (pictures / "a.jpg").read_bytes()
     (pictures / "half.jpg").write_bytes(data[: len(data) // 2])
     (pictures / "text.png").write_text("no picture")
@@ -101,7 +101,7 @@ def test_folder_goes_on_past_bad_pictures(
         "text.png": "unreadable",
     }
     words = capsys.readouterr().out
-    assert "2 of 5 pictures have a pose, 3 failed" in words
+    assert "pose found in 2 of 5 pictures, 3 failed" in words
     assert "truncated" in words
     assert "1 of the poses may be that of a symmetric counterpart" in words
     assert [record.get("attitude_confidence") for record in records(out)] == [0.9, None, 0.2, None, None]
@@ -185,7 +185,7 @@ def test_no_pose_at_all_is_two_but_is_recorded(use: Use, refused: Refused, pictu
     use(ToyEstimator(blind=frozenset({0})))
     out = tmp_path / "out"
     line = refused("predict", pictures / "a.jpg", *MODEL, *LENS, "--out", out)
-    assert "no pose in any of 1 pictures; the first, a.jpg: the locator finds no spacecraft" in line
+    assert "no pose in any of 1 picture; the first, a.jpg: the locator finds no spacecraft" in line
     assert records(out)[0]["failure"]["kind"] == "no_spacecraft"
 
 
@@ -379,7 +379,7 @@ def test_a_stop_signal_ends_after_the_picture_and_says_what_is_kept(
     monkeypatch.setattr(ToyEstimator, "estimate", estimate)
     out = tmp_path / "out"
     line = refused("predict", film, *MODEL, *LENS, "--video", "--out", out, code=code)
-    assert "interrupted; the results of 1 pictures are in" in line
+    assert f"interrupted; {out} holds the results of 1 picture;" in line
     assert "--resume" in line
     assert len(records(out)) == 1
     assert open_video(out / "overlay.mp4").announced == 1
@@ -412,7 +412,7 @@ def test_a_full_disk_costs_overlays_and_no_pose(
     assert len(records(out)) == 3
     words = capsys.readouterr().err
     assert "warning: 3 overlays could not be written; the first, a.jpg: " in words
-    assert "warning: 3 frames of the film could not be written" in words
+    assert "warning: 3 video frames could not be written" in words
 
 
 def test_results_of_another_run_are_refused_and_replaced_when_asked(

@@ -94,11 +94,11 @@ def _annotation(index: int, number: int) -> Annotation:
 @dataclass(frozen=True, eq=False)
 class ToyEstimator:
     """Knows the truth of a toy picture by its number; `error` shifts it, numbers in `blind` have no pose, and those in
-    `doubted` one that its belief is against."""
+    `ambiguous` one that is ambiguous."""
 
     error: float = 0.0
     blind: frozenset[int] = frozenset()
-    doubted: frozenset[int] = frozenset()
+    ambiguous: frozenset[int] = frozenset()
     spacecraft: Spacecraft = field(default_factory=toy_spacecraft)
     has_locator: bool = True
 
@@ -118,8 +118,8 @@ class ToyEstimator:
             np.tile(np.eye(2), (count, 1, 1)),
         )
         covariance = np.diag([4e-4, 4e-4, 4e-4, 2.5e-3, 2.5e-3, 2.5e-3])
-        inliers, belief = np.ones(count, dtype=bool), 0.2 if number in self.doubted else 0.9
-        return Estimate(keypoints, moved, covariance, inliers, self.error, box or found, attitude_confidence=belief)
+        inliers, confidence = np.ones(count, dtype=bool), 0.2 if number in self.ambiguous else 0.9
+        return Estimate(keypoints, moved, covariance, inliers, self.error, box or found, attitude_confidence=confidence)
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,14 +56,16 @@ def test_eval_says_what_it_knows_and_what_it_does_not(
     capsys.readouterr()
     gknet("eval", folder, "--model", model, "--out", tmp_path, "--threads", 1)
     content = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
-    assert (content["spacecraft"], content["passed_over"]) == ("Satellite_07", [])
+    assert (content["spacecraft"], content["skipped"]) == ("Satellite_07", [])
     assert content["unknown"] == ["visible", "sun_direction"]
     found = content["runs"]["oracle"]
     assert (found["frames"], found["sequences"]) == (3, 1)
     assert found["metrics"]["rmse_px"]["frames"] == found["metrics"]["e_t"]["frames"] == 3
     assert "rmse_hidden_px" not in found["metrics"]
     by = {b["by"] for b in found["bins"]}
-    assert by - {"attitude_confidence"} == {"range_diameters"}  # the belief is of poses, and there may be none
+    assert by - {"attitude_confidence"} == {
+        "range_diameters"
+    }  # the attitude confidence is of poses, and there may be none
     assert list(found["keypoints"])[:2] == ["keypoint_01", "keypoint_02"]
     assert all(k["frames"] > 0 and k["hidden_median_px"] is None for k in found["keypoints"].values())
     for told in (capsys.readouterr().out, (tmp_path / "report.html").read_text(encoding="utf-8")):

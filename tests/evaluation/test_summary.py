@@ -10,7 +10,7 @@ import pytest
 
 from gknet.errors import GknetError
 from gknet.evaluation.metrics import FrameErrors, compute_errors
-from gknet.evaluation.summary import summarise
+from gknet.evaluation.summary import Statistic, summarise
 from gknet.frame import FailureKind
 from tests.evaluation.test_metrics import CRAFT, FRAME, POSE, estimate_at
 
@@ -32,6 +32,12 @@ def many(sequences: int, frames: int, seed: int) -> list[FrameErrors]:
     return found
 
 
+def interval(found: Statistic) -> tuple[float, float]:
+    assert found.low is not None
+    assert found.high is not None
+    return found.low, found.high
+
+
 def test_everything_is_counted() -> None:
     summary = summarise(many(6, 20, 0))
     assert (summary.frames, summary.sequences, summary.failures) == (120, 6, {FailureKind.TOO_FEW_INLIERS: 12})
@@ -50,12 +56,25 @@ def test_everything_is_counted() -> None:
 def test_interval_resamples_sequences_and_covers() -> None:
     """Frames of a sequence err together: the interval of the mean must be as wide as the sequences make it."""
     covered = [
-        s.low <= 10 <= s.high for s in (summarise(many(12, 10, k), resamples=200).metrics["rmse_px"] for k in range(60))
+        low <= 10 <= high
+        for low, high in (interval(summarise(many(12, 10, k), resamples=200).metrics["rmse_px"]) for k in range(60))
     ]
     assert 0.8 <= np.mean(covered) <= 1.0
     apart = [replace(e, sequence=e.name) for e in many(12, 10, 0)]
-    together, alone = summarise(many(12, 10, 0)).metrics["rmse_px"], summarise(apart).metrics["rmse_px"]
-    assert together.high - together.low > 1.5 * (alone.high - alone.low)
+    together, alone = (np.ptp(interval(summarise(e).metrics["rmse_px"])) for e in (many(12, 10, 0), apart))
+    assert together > 1.5 * alone
+
+
+def test_one_sequence_has_no_interval() -> None:
+    """Resamples of one sequence are all alike: their spread is no uncertainty."""
+    alone = summarise(many(1, 10, 0))
+    assert {(s.low, s.high) for s in alone.metrics.values()} == {(None, None)}
+    assert json.loads(json.dumps(alone.to_dict()))["metrics"]["e_t"]["low"] is None
+    both = [*many(2, 10, 0)]
+    both[:10] = [replace(e, nees=None) for e in both[:10]]
+    metrics = summarise(both).metrics
+    assert metrics["nees"].low is None  # one of the two sequences has it
+    assert metrics["e_t"].low is not None
 
 
 def test_it_is_deterministic_and_json() -> None:

@@ -55,6 +55,11 @@ def test_record_holds_the_estimate() -> None:
     assert (entry["inlier_count"], entry["reprojection_rms_px"], entry["box"]) == (1, 0.5, [0, 1, 2, 3])
 
 
+def test_the_time_has_nine_digits_like_every_number() -> None:
+    assert record("x", 0.1 + 0.5, estimate(), NAMES)["time_s"] == 0.6
+    assert record("x", None, estimate(), NAMES)["time_s"] is None
+
+
 @pytest.mark.parametrize(
     "entry",
     [

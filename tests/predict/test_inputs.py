@@ -147,7 +147,7 @@ def test_what_gknet_wrote_is_no_input(tmp_path: Path) -> None:
         find_files([tmp_path / "predictions"])
 
 
-def test_pipes_in_a_folder_are_passed_over(tmp_path: Path) -> None:
+def test_pipes_in_a_folder_are_skipped(tmp_path: Path) -> None:
     touched(tmp_path, "1.png")
     os.mkfifo(tmp_path / "pipe.png")
     assert names(tmp_path) == ["1.png"]

@@ -127,5 +127,5 @@ def test_a_drawing_that_fails_costs_no_pose(tmp_path: Path, monkeypatch: pytest.
     with writer(tmp_path, overlays=True, fps=5.0) as results:
         results.add(frame(0), estimate(0))
     assert results.pose_count == 1
-    assert results.losses == ["1 overlays could not be written; the first, 0.jpg: ZeroDivisionError"]
+    assert results.losses == ["1 overlay could not be written; the first, 0.jpg: ZeroDivisionError"]
     assert names(tmp_path) == ["poses.jsonl", "prediction.json"]

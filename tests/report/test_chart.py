@@ -39,8 +39,19 @@ def test_logarithmic_axis() -> None:
     svg = curve_chart("t", Axis("x", log=True, low=1, high=100), Axis("y"), [Series("", x, np.ones(3))])
     ((first, middle, last),) = polylines(svg)
     assert middle[0] == pytest.approx((first[0] + last[0]) / 2, abs=0.1)
+    assert "x (log scale)" in texts(svg)
     with pytest.raises(GknetError, match="starts above 0"):
         curve_chart("t", Axis("x", log=True, low=0), Axis("y"), [Series("", x, np.ones(3))])
+
+
+def test_a_value_without_an_interval_has_no_whisker() -> None:
+    low, high = np.array([0.5, np.nan]), np.array([1.5, np.nan])
+    series = [Series("", np.arange(2.0), np.ones(2), low, high)]
+    svg = bar_chart("t", Axis("x"), ["p", "q"], series)
+    assert svg.count('class="whisker"') == 1
+    svg = curve_chart("t", Axis("x"), Axis("y"), series)
+    assert svg.count('<line class="line s0"') == 1
+    assert svg.count("<circle") == 2
 
 
 @pytest.mark.parametrize("y", [np.full(3, np.nan), np.array([1.0, np.nan, 2]), np.zeros(3), np.full(3, 1e-9)])

@@ -60,9 +60,10 @@ def evaluate(
 def print_gaps(evaluation: Evaluation) -> None:
     """One line for each thing that the dataset lacks, and one for the frames that are in no mean."""
     from gknet.evaluation.evaluate import UNKNOWN_WORDS
+    from gknet.io.text import counted
 
     for column in evaluation.unknown:
         print_line(f"unknown, no column '{column}': {UNKNOWN_WORDS[column]}")
-    bad = evaluation.passed_over
+    bad = evaluation.skipped
     if bad:
-        print_line(f"{len(bad)} frames were passed over; the first, {bad[0].name}: {bad[0].failure}")
+        print_line(f"{counted(len(bad), 'frame')} skipped; the first, {bad[0].name}: {bad[0].failure}")

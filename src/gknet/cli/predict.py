@@ -183,15 +183,16 @@ def _camera_words(
 def print_summary(writer: PredictionWriter) -> None:
     """The summary on standard output; GknetError when no picture gave a pose."""
     from gknet.frame import AMBIGUOUS_BELOW
+    from gknet.io.text import counted
 
     failures = writer.failures
     for sentence in writer.losses:
         print_warning(sentence)
     if writer.pose_count == 0:
         first = f"; the first, {failures[0].name}: {failures[0].failure}" if failures else ""
-        raise GknetError(f"no pose in any of {writer.count} pictures{first}")
+        raise GknetError(f"no pose in any of {counted(writer.count, 'picture')}{first}")
     kept = f", {writer.kept_count} of them from an earlier run" if writer.kept_count else ""
-    print_line(f"{writer.pose_count} of {writer.count} pictures have a pose, {len(failures)} failed{kept}")
+    print_line(f"pose found in {writer.pose_count} of {counted(writer.count, 'picture')}, {len(failures)} failed{kept}")
     if writer.ambiguous_count:
         print_line(
             f"  {writer.ambiguous_count} of the poses may be that of a symmetric counterpart: "

@@ -23,16 +23,18 @@ def render(
 ) -> None:
     """Render a dataset in the SKD layout, with poses, keypoint visibility and a contact sheet."""
     from gknet.errors import GknetError
+    from gknet.io.text import counted
     from gknet.render.generate import generate
     from gknet.render.render_progress import RenderProgress
 
     with RenderProgress() as progress:
         result = generate(recipe, out, options, selection, workers, on_progress=progress.show)
     print_line(
-        f"{result.out}: {result.rendered} frames rendered in {result.seconds:.0f} s, "
-        f"{result.kept} were there, {len(result.failures)} failed"
+        f"{result.out}: {counted(result.rendered, 'frame')} rendered in {result.render_seconds:.0f} s, "
+        f"{result.kept} were there, {len(result.failures)} failed; {result.seconds:.0f} s with all preparation"
     )
     if result.failures:
         raise GknetError(
-            f"{len(result.failures)} frames failed, the first: {result.failures[0]}; run again to try them again"
+            f"{counted(len(result.failures), 'frame')} failed, the first: {result.failures[0]}; "
+            "run again to try them again"
         )

@@ -89,13 +89,13 @@ class Evaluation:
         spacecraft: Whose poses they are.
         data: Where the frames come from, for people.
         runs: One for each protocol, over the same frames.
-        passed_over: Frames that could not be read or show no keypoint; they are in no mean.
+        skipped: Frames that could not be read or show no keypoint; they are in no mean.
     """
 
     spacecraft: Spacecraft
     data: str
     runs: tuple[ProtocolRun, ...]
-    passed_over: tuple[Unreadable, ...]
+    skipped: tuple[Unreadable, ...]
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -113,7 +113,7 @@ class Evaluation:
             "spacecraft": self.spacecraft.name,
             "data": self.data,
             "unknown": list(self.unknown),
-            "passed_over": [{"name": bad.name, "failure": bad.failure.to_dict()} for bad in self.passed_over],
+            "skipped": [{"name": bad.name, "failure": bad.failure.to_dict()} for bad in self.skipped],
             "runs": {run.protocol: self._run_dict(run) for run in self.runs},
         }
 
@@ -179,7 +179,7 @@ def evaluate(
     data: str = "",
     on_frame: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Estimate every frame under each protocol; a frame that cannot be read is recorded and passed over.
+    """Estimate every frame under each protocol; a frame that cannot be read is recorded and skipped.
 
     Args:
         dataset: With true poses.
@@ -192,24 +192,24 @@ def evaluate(
         GknetError: No frame could be used.
     """
     cases: dict[Protocol, list[Case]] = {protocol: [] for protocol in protocols}
-    passed_over = []
+    skipped = []
     for i in range(len(dataset)):
-        frame = _judged_frame(dataset, i, estimator.spacecraft)
+        frame = _usable_frame(dataset, i, estimator.spacecraft)
         if isinstance(frame, Unreadable):
-            passed_over.append(frame)
+            skipped.append(frame)
         else:
             for protocol in protocols:
                 cases[protocol].append(_case(i, frame, dataset.sequence_of(i), estimator, protocol))
         on_frame()
     if not any(cases.values()):
-        first = f"; the first: {passed_over[0].failure}" if passed_over else ""
+        first = f"; the first: {skipped[0].failure}" if skipped else ""
         raise GknetError(f"evaluation: none of {len(dataset)} frames could be used{first}")
     runs = tuple(ProtocolRun(protocol, tuple(cases[protocol])) for protocol in protocols)
-    return Evaluation(estimator.spacecraft, data or str(dataset.root), runs, tuple(passed_over))
+    return Evaluation(estimator.spacecraft, data or str(dataset.root), runs, tuple(skipped))
 
 
-def _judged_frame(dataset: SkdDataset, index: int, spacecraft: Spacecraft) -> Frame | Unreadable:
-    """A frame that shows a keypoint at least, or why it cannot be judged."""
+def _usable_frame(dataset: SkdDataset, index: int, spacecraft: Spacecraft) -> Frame | Unreadable:
+    """A frame that shows a keypoint at least, or why it cannot be used."""
     name = f"{dataset.sequence_of(index)}, frame {index}"
     try:
         frame = dataset.frame(index)

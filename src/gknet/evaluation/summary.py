@@ -48,15 +48,15 @@ class Statistic:
 
     Attributes:
         mean: The mean.
-        low: Lower end of its 95 % interval (bootstrap over sequences).
-        high: Upper end of it.
+        low: Lower end of its 95 % interval (bootstrap over sequences); None where one sequence alone has the metric.
+        high: Upper end of it; None with `low`.
         median: The median.
         frames: How many frames have the metric.
     """
 
     mean: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     median: float
     frames: int
 
@@ -160,12 +160,15 @@ def _statistics(frame_errors: Sequence[FrameErrors], seed: int, resamples: int) 
 
 def _statistic(values: Float[ndarray, " k"], sequence: ndarray, drawn: ndarray) -> Statistic:
     """`drawn` (resamples, sequences): how often each resample holds each sequence."""
+    mean, median = float(values.mean()), float(np.median(values))
+    if len(np.unique(sequence)) < 2:  # resamples of one sequence are all alike
+        return Statistic(mean, None, None, median, len(values))
     sums = np.bincount(sequence, weights=values, minlength=drawn.shape[1])
     counts = np.bincount(sequence, minlength=drawn.shape[1])
     frames = drawn @ counts
     means = (drawn @ sums)[frames > 0] / frames[frames > 0]
-    low, high = np.percentile(means, (2.5, 97.5)) if len(means) else (values.mean(), values.mean())
-    return Statistic(float(values.mean()), float(low), float(high), float(np.median(values)), len(values))
+    low, high = np.percentile(means, (2.5, 97.5))
+    return Statistic(mean, float(low), float(high), median, len(values))
 
 
 def _bins(frame_errors: Sequence[FrameErrors], seed: int, resamples: int) -> list[Bin]:

@@ -40,7 +40,7 @@ def record(name: str, time_s: float | None, estimate: Estimate, keypoint_names: 
     pose, box = estimate.cam_from_body, estimate.box
     return {
         "name": writable(name),
-        "time_s": time_s,
+        "time_s": _plain(time_s),
         "status": "ok" if pose is not None else "no pose",
         "failure": _failure_record(estimate.failure) if estimate.failure else None,
         "translation_m": _plain(pose.translation_m) if pose else None,

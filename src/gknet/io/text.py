@@ -39,6 +39,11 @@ def printable(text: object) -> str:
     return "".join(_escaped(character) if _is_unprintable(character) else character for character in str(text))
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun: "1 frame", "2 frames"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def writable(text: str) -> str:
     """A name from outside as text that UTF-8 can take: lone surrogates become the escapes that `printable` gives."""
     return "".join(_escaped(character) if _is_surrogate(character) else character for character in text)

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gknet.io.image import write_image
 from gknet.io.opencv import quiet
-from gknet.io.text import printable
+from gknet.io.text import counted, printable
 from gknet.io.video import VideoWriter
 
 _NAME_BYTES = 200
@@ -29,7 +29,7 @@ class Losses:
     """What could not be written.
 
     Attributes:
-        what: What is counted, in the plural.
+        what: What is counted, in the singular.
         count: How many were lost.
         first: The first one and why.
     """
@@ -46,7 +46,8 @@ class Losses:
     @property
     def sentence(self) -> str | None:
         """For the user; None when nothing was lost."""
-        return f"{self.count} {self.what} could not be written; the first, {self.first}" if self.count else None
+        words = counted(self.count, self.what)
+        return f"{words} could not be written; the first, {self.first}" if self.count else None
 
 
 @dataclass
@@ -84,7 +85,7 @@ class OverlayFolder:
 
     folder: Path
     names: OverlayNames = field(default_factory=OverlayNames)
-    losses: Losses = field(default_factory=lambda: Losses("overlays"))
+    losses: Losses = field(default_factory=lambda: Losses("overlay"))
 
     def write(self, name: str, picture: UInt8[ndarray, "h w 3"]) -> None:
         """Write the overlay of a picture, or count it as lost."""
@@ -102,7 +103,7 @@ class OverlayFilm:
 
     path: Path
     fps: float
-    losses: Losses = field(default_factory=lambda: Losses("frames of the film"))
+    losses: Losses = field(default_factory=lambda: Losses("video frame"))
     _writer: VideoWriter | None = None
 
     def write(self, name: str, picture: UInt8[ndarray, "h w 3"]) -> None:

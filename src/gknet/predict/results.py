@@ -76,7 +76,7 @@ class PredictionWriter:
         self._spacecraft, self._layout, self._record, self._existing = spacecraft, layout, record, existing
         self._overlays = OverlayFolder(self.overlay_folder) if self.overlay_folder else None
         self._film = OverlayFilm(self.video_path, fps) if self.video_path and fps is not None else None
-        self._undrawn = Losses("overlays")
+        self._undrawn = Losses("overlay")
         self._kept: Counter[str] = Counter()
         self._stack = ExitStack()
         self._poses: PoseWriter | None = None

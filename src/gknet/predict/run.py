@@ -9,6 +9,7 @@ import cv2
 from gknet.errors import GknetError
 from gknet.frame import Box, Estimate, Failure, FailureKind, Frame, PoseEstimator, Unreadable
 from gknet.io.interrupt import Interruption
+from gknet.io.text import counted
 from gknet.predict.results import PredictionWriter
 
 
@@ -21,7 +22,7 @@ def predict_all(
 ) -> None:
     """Estimate the pose in each picture and hand it to the writer.
 
-    A picture that cannot be read, or that the estimator refuses, is recorded and passed over. A picture that the writer
+    A picture that cannot be read, or that the estimator refuses, is recorded and skipped. A picture that the writer
     has from an earlier run is skipped.
 
     Args:
@@ -69,4 +70,4 @@ def _estimate(frame: Frame, estimator: PoseEstimator, box: Box | None, oracle: b
 def _kept_words(writer: PredictionWriter) -> str:
     if writer.count == 0:
         return ""
-    return f"the results of {writer.count} pictures are in {writer.folder}; --resume goes on with them"
+    return f"{writer.folder} holds the results of {counted(writer.count, 'picture')}; --resume goes on with them"

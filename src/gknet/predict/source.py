@@ -175,7 +175,7 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class DatasetFrames:
-    """The frames of an SKD dataset with their truth; a bad one is reported and passed over."""
+    """The frames of an SKD dataset with their truth; a bad one is reported and skipped."""
 
     dataset: SkdDataset
 

@@ -51,13 +51,15 @@ class Generated:
         rendered: Frames that are new.
         kept: Selected frames that were there before.
         failures: Reasons, one for each frame that has no picture.
-        seconds: Of the whole run.
+        render_seconds: Of rendering the new frames; 0 when there were none.
+        seconds: Of the whole run, with its preparation and the contact sheet.
     """
 
     out: Path
     rendered: int
     kept: int
     failures: tuple[str, ...]
+    render_seconds: float
     seconds: float
 
 
@@ -105,11 +107,13 @@ def generate(
     kept = sum(len(plan.indices) for plan in plans) - todo
     for name in sorted({plan.spacecraft for plan in missing if plan.indices}):
         load_mesh(fleet[name])
+    render_started = time.monotonic()
     failures = _render(job, missing, fleet, workers, variant or choose_variant(), on_progress) if todo else ()
+    render_seconds = time.monotonic() - render_started if todo else 0.0
     with folder_lock(job.root):
         write_splits(job.root, job.recipe.split_of, job.recipe.spacecraft_of)
     write_contact_sheet(job.root)
-    return Generated(job.root, todo - len(failures), kept, failures, time.monotonic() - started)
+    return Generated(job.root, todo - len(failures), kept, failures, render_seconds, time.monotonic() - started)
 
 
 def _need_mitsuba() -> None:

@@ -27,8 +27,8 @@ class Series:
         name: In the legend; an empty one is left out.
         x: (k,) values across; bars leave them out of account.
         y: (k,) values up, or lengths of the bars; what is not finite is not drawn.
-        low: (k,) lower ends of whiskers; None for none.
-        high: (k,) upper ends of whiskers; None for none.
+        low: (k,) lower ends of whiskers, NaN where there is none; None for none at all.
+        high: (k,) upper ends of whiskers, likewise.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Axis:
 
     Attributes:
         label: With the unit.
-        log: Logarithmic.
+        log: Logarithmic; the label states it.
         low: The first value; None takes it from the data.
         high: The last value; None takes it from the data.
     """
@@ -53,6 +53,11 @@ class Axis:
     log: bool = False
     low: float | None = None
     high: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The label as it is drawn."""
+        return f"{self.label} (log scale)" if self.log else self.label
 
 
 @dataclass(frozen=True)
@@ -203,7 +208,7 @@ def _frame(across: _Scale, up: _Scale) -> str:
         parts.append(f'<text x="{_LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{_tick_text(tick)}</text>')
     middle = (_TOP + _HEIGHT - _BOTTOM) / 2
     turn = f'transform="rotate(-90 16 {middle})"'
-    parts.append(f'<text x="16" y="{middle}" text-anchor="middle" {turn}>{escaped(up.axis.label)}</text>')
+    parts.append(f'<text x="16" y="{middle}" text-anchor="middle" {turn}>{escaped(up.axis.words)}</text>')
     return "".join(parts)
 
 
@@ -215,7 +220,7 @@ def _vertical_grid(across: _Scale, top: float, bottom: float) -> str:
         parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{_tick_text(tick)}</text>')
     parts.append(f'<line class="axis" x1="{across.start:.1f}" x2="{across.end:.1f}" y1="{bottom}" y2="{bottom}"/>')
     middle = (across.start + across.end) / 2
-    parts.append(f'<text x="{middle:.1f}" y="{bottom + 36}" text-anchor="middle">{escaped(across.axis.label)}</text>')
+    parts.append(f'<text x="{middle:.1f}" y="{bottom + 36}" text-anchor="middle">{escaped(across.axis.words)}</text>')
     return "".join(parts)
 
 
@@ -243,7 +248,8 @@ def _curve(k: int, series: Series, across: _Scale, up: _Scale) -> str:
     if series.low is None or series.high is None:
         return "".join(parts)
     for (x, y), low, high in zip(points, series.low[known], series.high[known], strict=True):
-        parts.append(f'<line class="line s{k}" x1="{x:.1f}" x2="{x:.1f}" y1="{up(low):.1f}" y2="{up(high):.1f}"/>')
+        if np.isfinite(low) and np.isfinite(high):
+            parts.append(f'<line class="line s{k}" x1="{x:.1f}" x2="{x:.1f}" y1="{up(low):.1f}" y2="{up(high):.1f}"/>')
         parts.append(f'<circle class="fill s{k}" cx="{x:.1f}" cy="{y:.1f}" r="3.6"/>')
     return "".join(parts)
 
@@ -255,7 +261,7 @@ def _bar(k: int, series: Series, row: int, across: _Scale, top: float, thick: fl
     width = max(0.5, across(value) - across.start)
     place = f'x="{across.start:.1f}" y="{top:.1f}" width="{width:.1f}" height="{thick:.1f}"'
     bar = f'<rect class="fill s{k}" {place} rx="2"/>'
-    if series.low is None or series.high is None:
+    if series.low is None or series.high is None or not np.isfinite([series.low[row], series.high[row]]).all():
         return bar
     middle, low, high = top + thick / 2, across(series.low[row]), across(series.high[row])
     return bar + f'<line class="whisker" x1="{low:.1f}" x2="{high:.1f}" y1="{middle:.1f}" y2="{middle:.1f}"/>'

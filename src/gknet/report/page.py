@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gknet import __version__
 from gknet.evaluation.evaluate import PROTOCOL_WORDS, UNKNOWN_WORDS, Evaluation, ProtocolRun
 from gknet.evaluation.summary import Statistic
+from gknet.io.text import counted
 from gknet.report.chart import page_style
 from gknet.report.gallery import Gallery
 from gknet.report.markup import escaped
@@ -58,7 +59,7 @@ def _section(section: Section) -> str:
     evaluation = section.evaluation
     name = escaped(evaluation.spacecraft.name)
     first = evaluation.runs[0].summary
-    words = [f"{evaluation.data}: {first.frames} frames of {first.sequences} sequences"]
+    words = [f"{evaluation.data}: {counted(first.frames, 'frame')} of {counted(first.sequences, 'sequence')}"]
     words += [f"Unknown: {UNKNOWN_WORDS[column]}." for column in evaluation.unknown]
     lines = "".join(f'<p class="quiet">{escaped(line)}</p>' for line in words)
     return (
@@ -70,14 +71,14 @@ def _section(section: Section) -> str:
 
 
 def _cards(evaluation: Evaluation) -> str:
-    """The few numbers that one looks for first, of the last run: the one nearest to real use."""
+    """The headline numbers of the last run, which is the one nearest to real use."""
     run = evaluation.runs[-1]
     found = run.summary.metrics
     cards = [
         ("mean RMSE", _short(found.get("rmse_px"), 2), "px of 256"),
         ("mean E_t", _short(found.get("e_t"), 4), "of the range"),
         ("mean E_q", _short(found.get("e_q_rad"), 4), "rad"),
-        ("failures", str(failure_count(run)), f"of {run.summary.frames} frames"),
+        ("failures", str(failure_count(run)), f"of {counted(run.summary.frames, 'frame')}"),
     ]
     if run.protocol == "detected":
         cards.append(("box IoU of 0.7 or more", percent_text(run.summary.located_07), "of frames"))
@@ -132,12 +133,10 @@ def _failures(evaluation: Evaluation) -> str:
         for run in evaluation.runs
         for kind, count in run.summary.failures.items()
     ]
-    items += [
-        f"<li>passed over: {escaped(bad.name)}: {escaped(str(bad.failure))}</li>" for bad in evaluation.passed_over
-    ]
+    items += [f"<li>passed over: {escaped(bad.name)}: {escaped(str(bad.failure))}</li>" for bad in evaluation.skipped]
     if not items:
         return ""
-    return f"<details><summary>Failures and why ({len(items)} kinds)</summary><ul>{''.join(items)}</ul></details>"
+    return f"<details><summary>Failures and why ({len(items)})</summary><ul>{''.join(items)}</ul></details>"
 
 
 def _gallery(gallery: Gallery) -> str:

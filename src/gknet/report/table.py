@@ -40,15 +40,15 @@ class Row:
 ROWS = (
     Row("rmse_px", "RMSE", "px of 256", 2, "keypoints in view, root mean square in each image"),
     Row("rmse_hidden_px", "RMSE, hidden", "px of 256", 2, "the keypoints in view that the spacecraft hides"),
-    Row("pck_2", "PCK 2 px", "part", 3, "keypoints nearer than 2 px to the truth"),
-    Row("pck_5", "PCK 5 px", "part", 3, "keypoints nearer than 5 px to the truth"),
-    Row("pck_10", "PCK 10 px", "part", 3, "keypoints nearer than 10 px to the truth"),
+    Row("pck_2", "PCK 2 px", "fraction", 3, "keypoints nearer than 2 px to the truth"),
+    Row("pck_5", "PCK 5 px", "fraction", 3, "keypoints nearer than 5 px to the truth"),
+    Row("pck_10", "PCK 10 px", "fraction", 3, "keypoints nearer than 10 px to the truth"),
     Row("e_t", "E_t", "of range", 4, "translation error over range; a failure counts as 1"),
     Row("e_q_rad", "E_q", "rad", 4, "rotation error; a failure counts as pi"),
     Row("speed_score", "SPEED score", "", 4, "E_t + E_q"),
     Row("add", "ADD", "diameters", 4, "mean distance of the keypoints between both poses"),
     Row("add_s", "ADD-S", "diameters", 4, "the same to the nearest keypoint"),
-    Row("add_below_tenth", "ADD < 0.1", "part", 3, "frames whose ADD is below a tenth of the diameter"),
+    Row("add_below_tenth", "ADD < 0.1", "fraction", 3, "frames whose ADD is below a tenth of the diameter"),
     Row("locator_iou", "Box IoU", "", 3, "overlap of the box used with the true one"),
     Row("nees", "NEES", "", 1, "squared pose error over its covariance; 6 is right"),
 )
@@ -71,8 +71,11 @@ def statistic(run: ProtocolRun, metric: str) -> Statistic | None:
 
 
 def interval_text(found: Statistic | None, digits: int) -> str:
-    """The mean with its 95 % interval, "mean [low, high]"; "-" for None."""
-    return "-" if found is None else f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+    """The mean with its 95 % interval where there is one, "mean [low, high]"; "-" for None."""
+    if found is None:
+        return "-"
+    mean = f"{found.mean:.{digits}f}"
+    return mean if found.low is None else f"{mean} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
 def median_text(found: Statistic | None, digits: int) -> str:
