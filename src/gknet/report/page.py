@@ -127,13 +127,13 @@ def _metric_cells(run: ProtocolRun, metric: str, digits: int) -> str:
 
 
 def _failures(evaluation: Evaluation) -> str:
-    """Kinds of failures, with the number of frames, and frames that were passed over; nothing where all went well."""
+    """Kinds of failures, with the number of frames, and frames that were skipped; nothing where all went well."""
     items = [
         f"<li>{escaped(PROTOCOL_WORDS[run.protocol])}: {count} x {escaped(kind.label)}</li>"
         for run in evaluation.runs
         for kind, count in run.summary.failures.items()
     ]
-    items += [f"<li>passed over: {escaped(bad.name)}: {escaped(str(bad.failure))}</li>" for bad in evaluation.skipped]
+    items += [f"<li>skipped: {escaped(bad.name)}: {escaped(str(bad.failure))}</li>" for bad in evaluation.skipped]
     if not items:
         return ""
     return f"<details><summary>Failures and why ({len(items)})</summary><ul>{''.join(items)}</ul></details>"
