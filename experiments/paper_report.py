@@ -46,7 +46,7 @@ PAPER_POSE = {
     "GKNet": ((0.763, 0.547), (1.163, 1.016), (0.978, 1.485)),
 }
 PROTOCOLS = {
-    "paper": "the paper's read-out (highest cell of 32x32, plain PnP, oracle crop)",
+    "paper": "the paper's decoding (highest cell of 32x32, plain PnP, oracle crop)",
     "oracle": "ours, oracle crop",
     "detected": "ours, detected crop",
 }
@@ -129,7 +129,7 @@ def rmse_table(trials: Trials, names: tuple[str, ...], protocol: str, metric: st
 def pose_table(trials: Trials, protocol: str) -> str:
     rows = []
     for name in ORDER:
-        read = "oracle" if name == DIRECT and protocol == "paper" else protocol  # no heatmaps: one read-out
+        read = "oracle" if name == DIRECT and protocol == "paper" else protocol  # no heatmaps: nothing to decode
         both = [
             f"{cell(trials, name, craft, read, 'e_t')}; {cell(trials, name, craft, read, 'e_q_rad')}" for craft in NAMES
         ]
@@ -177,7 +177,7 @@ def difference_table(
     protocol: str,
     attitudes_hold: bool = False,
 ) -> str:
-    """Each first method less each second one; on all frames, or on those in which the attitudes of both hold."""
+    """Each first method less each second one; on all frames, or on those in which both attitudes are right."""
     rows = [
         [f"{first} less {second}", metric, *difference_row(trials, first, second, metric, protocol, attitudes_hold)]
         for first in firsts
@@ -204,12 +204,12 @@ def cost_table(costs: dict[str, list[dict]]) -> str:
                 str(len(found)),
             ]
         )
-    header = ["method", "parameters", "GMAC a crop", "ms a crop", "learning rate", "pictures", "minutes"]
+    header = ["method", "parameters", "GMAC a crop", "ms a crop", "learning rate", "images seen", "minutes"]
     return markdown([*header, "trainings"], rows)
 
 
 def curve_table(costs: dict[str, list[dict]]) -> str:
-    """Validation RMSE along the training, mean over the seeds: how many pictures it takes."""
+    """Validation RMSE along the training, mean over the seeds: how many images it takes."""
     curves: dict[tuple[str, str], list[list[list[float]]]] = defaultdict(list)
     for name, found in costs.items():
         for content in found:
@@ -219,7 +219,7 @@ def curve_table(costs: dict[str, list[dict]]) -> str:
         pictures, rmse = np.mean(each, axis=0).T  # (validations, 2)
         words = ", ".join(f"{value:.1f}" for value in rmse)
         rows.append([spacecraft, name, words, f"{pictures[-1]:.0f}", str(len(each))])
-    return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "pictures by then", "seeds"], rows)
+    return markdown(["spacecraft", "method", "RMSE at equal steps to the end", "images seen by then", "seeds"], rows)
 
 
 def graph_table(trials: Trials, words: Callable[[list[Trial]], str], protocol: str = "oracle") -> str:
@@ -265,9 +265,9 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
         "Made by `experiments/paper_tables.py` and `experiments/paper_report.py`; the method, the differences from the "
         "paper "
         "and what follows from the figures are in [docs/paper.md](../../../docs/paper.md). Means over the test frames "
-        "and seeds with 95 % intervals, bootstrapped over sequences, and over seeds where there are several: the luck "
-        "of a training is not in the interval of one seed, and too little in that of two or three. Pixels of the 256 "
-        "crop, radians.",
+        "and seeds with 95 % intervals, bootstrapped over sequences, and over seeds where there are several. The "
+        "variance between trainings is not in the interval of one seed, and too little in that of two or three. Pixels "
+        "of the 256 crop, radians.",
         *[f"![RMSE of the methods on {Path(name).stem}]({name})" for name in pictures],
         "## Cost\n" + cost_table(costs),
     ]
@@ -282,7 +282,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
         parts.append(f"## Table 2, pose: {words}\n" + pose_table(trials, protocol))
     parts.append(
         "## GKNet less the others, paired by frame, ours, oracle crop\n"
-        "Bold here and below: the interval excludes zero, and so says each seed.\n\n"
+        "Bold here and below: the interval excludes zero, and each seed has the same sign.\n\n"
     )
     parts[-1] += difference_table(trials, ("GKNet",), hybrid[:-1], ("rmse_px", "e_t", "e_q_rad"), "oracle")
     for protocol in ("oracle", "detected"):
@@ -301,7 +301,7 @@ def page(trials: Trials, costs: dict[str, list[dict]], scale: str, pictures: lis
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], METRICS, "oracle")
     parts.append(f"## Frames with a wrong attitude (E_q above {ATTITUDE_HOLDS_RAD} rad), ours, oracle crop\n")
     parts[-1] += graph_table(trials, wrong_attitudes)
-    parts.append("## The skeleton less the other graphs, where the attitudes of both hold\n")
+    parts.append("## The skeleton less the other graphs, on frames where both attitudes are right\n")
     parts[-1] += difference_table(trials, ("GKNet",), GRAPHS[1:], METRICS, "oracle", attitudes_hold=True)
     parts.append(
         "## Swaps among the detections that lie at a keypoint, ours, oracle crop\n" + graph_table(trials, swaps)
