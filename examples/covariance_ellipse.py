@@ -37,18 +37,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("ellipses.png"))
     arguments = parser.parse_args()
 
-    picture = cv2.imread(str(arguments.image))
-    if picture is None:
+    pixels = cv2.imread(str(arguments.image))
+    if pixels is None:
         raise SystemExit(f"{arguments.image}: cannot be read as an image")
-    camera = gknet.Camera.from_focal(arguments.focal_px, picture.shape[1], picture.shape[0])
-    estimate = gknet.load_estimator(arguments.spacecraft).estimate(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), camera)
+    camera = gknet.Camera.from_focal(arguments.focal_px, pixels.shape[1], pixels.shape[0])
+    estimate = gknet.load_estimator(arguments.spacecraft).estimate(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), camera)
     if estimate.keypoints is None or estimate.covariance is None or estimate.inliers is None:
         raise SystemExit(f"no pose: {estimate.failure}")
 
     for k, centre in enumerate(estimate.keypoints.pixels):
         colour = (80, 220, 80) if estimate.inliers[k] else (60, 60, 230)  # BGR: inliers green, outliers red
-        draw_ellipse(picture, centre, estimate.keypoints.covariance_px2[k], colour)
-    cv2.imwrite(str(arguments.out), picture)
+        draw_ellipse(pixels, centre, estimate.keypoints.covariance_px2[k], colour)
+    cv2.imwrite(str(arguments.out), pixels)
 
     sigma, position_m2 = np.sqrt(np.diag(estimate.covariance)), estimate.covariance[3:, 3:]
     assert estimate.cam_from_body is not None
