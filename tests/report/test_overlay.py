@@ -13,7 +13,8 @@ from gknet.frame import Estimate, Failure, FailureKind, Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.report.canvas import Canvas
-from gknet.report.overlay import confidence, describe, draw_overlay, zoomed
+from gknet.report.legend import Entry, draw_legend
+from gknet.report.overlay import _legend_entries, describe, draw_overlay, mean_score, zoomed
 from gknet.report.palette import SKY, score_colour
 from tests.cli.toy import CAMERA, ToyEstimator, toy_picture, toy_pose, toy_spacecraft
 
@@ -120,13 +121,70 @@ def test_words() -> None:
     frame = toy_frame()
     estimate = toy_estimate(frame)
     words = describe(frame, estimate)
-    assert words[1] == f"range {frame.range_m:.2f} m ± 0.05 m"
-    assert words[2].endswith("13 of 13 keypoints")
-    assert confidence(estimate) == pytest.approx(keypoints_of(estimate).score.mean())
+    assert words[1] == f"range {frame.range_m:.3f} ± 0.050 m"
+    score = keypoints_of(estimate).score.mean()
+    assert words[2] == f"13 of 13 inliers, mean keypoint score {score:.2f}"
+    assert mean_score(estimate) == pytest.approx(score)
     assert describe(frame, DARK) == ["toy/1", "no pose: dark"]
-    assert confidence(DARK) is None
+    assert mean_score(DARK) is None
     for value, line in ((0.97, "attitude confidence 0.97"), (0.31, "attitude confidence 0.31, ambiguous")):
         assert describe(frame, replace(estimate, attitude_confidence=value))[3] == line
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "words"),
+    [(3.21, "range 14.3 ± 3.2 m"), (0.1, "range 14.28 ± 0.10 m"), (0.0123, "range 14.278 ± 0.012 m"),
+     (40.0, "range 14 ± 40 m"), (0.0, "range 14.2778 ± 0.0000 m")],
+)  # fmt: skip
+def test_range_and_its_deviation_have_the_same_decimals(sigma_m: float, words: str) -> None:
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 14.27784]))
+    assert describe(toy_frame(), Estimate(cam_from_body=pose, covariance=np.eye(6) * sigma_m**2))[1] == words
+    assert describe(toy_frame(), Estimate(cam_from_body=pose))[1] == "range 14.28 m"
+
+
+def legend_words(frame: Frame, estimate: Estimate, with_truth: bool) -> list[str]:
+    return [entry.text for entry in _legend_entries(frame, estimate, with_truth)]
+
+
+def test_the_legend_names_the_marks_that_are_drawn() -> None:
+    frame = toy_frame()
+    lines, marks = ["estimate", "body axes", "truth", "box"], ["visible", "hidden", "outlier", "keypoint score, 0 to 1"]
+    assert legend_words(frame, toy_estimate(frame), True) == lines + marks
+    assert legend_words(frame, DARK, True) == ["truth"]
+    assert legend_words(frame, DARK, False) == []
+    unlabelled = legend_words(replace(frame, visible=None), toy_estimate(frame), False)
+    assert "visibility unknown" in unlabelled
+    assert not {"truth", "visible", "hidden"} & set(unlabelled)
+
+
+def test_without_labels_no_keypoint_is_drawn_as_visible() -> None:
+    """A square has corners, which a disc lacks."""
+    frame = toy_frame()
+    estimate = toy_estimate(frame)
+    pictures = [
+        draw_overlay(each, TOY, estimate, lines=(), truth=False, legend=False)
+        for each in (replace(frame, visible=np.ones(TOY.keypoint_count, dtype=bool)), replace(frame, visible=None))
+    ]
+    for k in range(TOY.keypoint_count):
+        colour = score_colour(float(keypoints_of(estimate).score[k]))
+        corner = keypoints_of(estimate).pixels[k] + 4
+        if not near(pictures[0], colour, corner, reach=0):
+            break
+    else:
+        pytest.fail("every disc fills its corner")
+    assert near(pictures[1], colour, corner, reach=0)
+
+
+@pytest.mark.parametrize("width", [300, 700, 2000])
+def test_a_legend_stays_inside_of_the_picture(width: int) -> None:
+    canvas = Canvas(np.full((1024, width, 3), 128, dtype=np.uint8))
+    drawn: list[np.ndarray] = []
+    entries = [Entry(f"entry {k}", lambda _, left, right: drawn.extend((left, right))) for k in range(9)]
+    draw_legend(canvas, entries)
+    assert len(drawn) == 18
+    assert max(x for x, _ in drawn) < width
+    assert all(0 < y < 1024 for _, y in drawn)
+    assert len({y for _, y in drawn}) == {300: 5, 700: 2, 2000: 1}[width]
 
 
 @pytest.mark.parametrize("name", [os.fsdecode(b"caf\xe9"), "\ud800", "a\x1b\0\n", "z" * 300, "衛星", ""])

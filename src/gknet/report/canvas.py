@@ -123,6 +123,16 @@ class Canvas:
         cv2.circle(self.image, self._fixed(centre), size, INK, dark, cv2.LINE_AA, _SHIFT)
         cv2.circle(self.image, self._fixed(centre), size, colour, inner, cv2.LINE_AA, _SHIFT)
 
+    def square(self, centre: Float[ndarray, "2"], colour: RGB, radius: float = 5.0) -> None:
+        """A filled square; `radius` is half of its side."""
+        if not self._drawable(centre):
+            return
+        for reach, fill in ((radius + 1.3, INK), (radius, colour)):
+            offset = np.full(2, reach * self.unit / self.factor)
+            low, high = self._fixed(centre - offset), self._fixed(centre + offset)
+            corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])], dtype=np.int32)
+            cv2.fillConvexPoly(self.image, corners, fill, cv2.LINE_AA, _SHIFT)
+
     def cross(self, centre: Float[ndarray, "2"], colour: RGB, radius: float = 5.5) -> None:
         """Two diagonal segments."""
         reach = radius * self.unit / self.factor

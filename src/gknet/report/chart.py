@@ -78,6 +78,10 @@ class _Scale:
         part = float(np.clip((value - low) / (high - low), -0.02, 1.02))
         return self.start + part * (self.end - self.start)
 
+    def minor_ticks(self) -> list[float]:
+        """Between the ticks of a logarithmic axis: the multiples of each power of ten."""
+        return _multiples(self.low, self.high, range(1, 10)) if self.axis.log else []
+
     def ticks(self) -> list[float]:
         return _log_ticks(self.low, self.high) if self.axis.log else _linear_ticks(self.low, self.high)
 
@@ -192,6 +196,11 @@ def _linear_ticks(low: float, high: float) -> list[float]:
 def _log_ticks(low: float, high: float) -> list[float]:
     decades = np.log10(high / low)
     steps = (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 0.7 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+    return _multiples(low, high, steps)
+
+
+def _multiples(low: float, high: float, steps: Sequence[float]) -> list[float]:
+    """The multiples of powers of ten from `low` to `high`."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     return [m * 10.0**p for p in powers for m in steps if low * 0.999 <= m * 10.0**p <= high * 1.001]
 
@@ -202,6 +211,9 @@ def _tick_text(value: float) -> str:
 
 def _frame(across: _Scale, up: _Scale) -> str:
     parts = [_vertical_grid(across, _TOP, _HEIGHT - _BOTTOM)]
+    for tick in up.minor_ticks():
+        y = up(tick)
+        parts.append(f'<line class="axis" x1="{_LEFT}" x2="{_LEFT + 4}" y1="{y:.1f}" y2="{y:.1f}"/>')
     for tick in up.ticks():
         y = up(tick)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
@@ -214,6 +226,9 @@ def _frame(across: _Scale, up: _Scale) -> str:
 
 def _vertical_grid(across: _Scale, top: float, bottom: float) -> str:
     parts = []
+    for tick in across.minor_ticks():
+        x = across(tick)
+        parts.append(f'<line class="axis" x1="{x:.1f}" x2="{x:.1f}" y1="{bottom - 4}" y2="{bottom}"/>')
     for tick in across.ticks():
         x = across(tick)
         parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>')

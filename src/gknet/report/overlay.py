@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from gknet.errors import GknetError
@@ -14,6 +14,7 @@ from gknet.frame import Box, Estimate, Frame, Keypoints
 from gknet.geometry import Camera, Pose
 from gknet.inference.crop import Crop
 from gknet.report.canvas import Canvas, enlarged
+from gknet.report.legend import Entry, Icon, draw_legend
 from gknet.report.palette import BLUE, GREEN, PINK, RGB, SKY, VERMILLION, WHITE, score_colour
 from gknet.spacecraft import Spacecraft
 
@@ -22,6 +23,10 @@ _AXIS_LENGTH = 0.28
 """Of the spacecraft's diameter."""
 
 _NAME_CHARACTERS = 60
+_MOST_DECIMALS = 4
+Mark = Callable[[Canvas, Float[ndarray, "2"], RGB], None]
+"""Draws a keypoint."""
+
 _LEAST_SCORE = 0.05
 """A keypoint below has no place of its own, and is not drawn."""
 
@@ -68,25 +73,21 @@ def draw_overlay(
         _draw_axes(canvas, frame.camera, estimate.cam_from_body, spacecraft.diameter_m)
     _draw_panel(canvas, describe(frame, estimate) if lines is None else lines, failed=estimate.failure is not None)
     if legend:
-        _draw_legend(canvas, truth and frame.cam_from_body is not None)
+        draw_legend(canvas, _legend_entries(frame, estimate, truth and frame.cam_from_body is not None))
     return image
 
 
 def describe(frame: Frame, estimate: Estimate) -> list[str]:
-    """Name, range with its standard deviation, confidence in keypoints and attitude; or why there is no pose."""
+    """Name, range with its standard deviation, inliers, attitude confidence; or why there is no pose."""
     if estimate.cam_from_body is None:
         return [_short(frame.name), f"no pose: {estimate.failure}"]
     position = estimate.cam_from_body.translation_m
-    range_m = float(np.linalg.norm(position))
-    words = f"range {range_m:.2f} m"
-    if estimate.covariance is not None:
-        towards = position / range_m
-        sigma = float(np.sqrt(max(0.0, towards @ estimate.covariance[3:, 3:] @ towards)))
-        words += f" ± {sigma:.2g} m" if sigma < 0.1 else f" ± {sigma:.1f} m"
-    lines = [_short(frame.name), words]
-    mean_score = confidence(estimate)
-    if mean_score is not None and estimate.inliers is not None:
-        lines.append(f"confidence {mean_score:.2f}, {int(estimate.inliers.sum())} of {len(estimate.inliers)} keypoints")
+    lines = [_short(frame.name), _range_words(position, estimate.covariance)]
+    score = mean_score(estimate)
+    if score is not None and estimate.inliers is not None:
+        lines.append(
+            f"{int(estimate.inliers.sum())} of {len(estimate.inliers)} inliers, mean keypoint score {score:.2f}"
+        )
     if estimate.attitude_confidence is not None:
         ambiguous = ", ambiguous" if estimate.is_ambiguous else ""
         lines.append(f"attitude confidence {estimate.attitude_confidence:.2f}{ambiguous}")
@@ -95,13 +96,24 @@ def describe(frame: Frame, estimate: Estimate) -> list[str]:
     return lines
 
 
+def _range_words(position_m: Float[ndarray, "3"], covariance: Float[ndarray, "6 6"] | None) -> str:
+    """The range with its standard deviation: two significant digits of the latter, as many decimals of both."""
+    range_m = float(np.linalg.norm(position_m))
+    if covariance is None:
+        return f"range {range_m:.2f} m"
+    towards = position_m / range_m
+    sigma = float(np.sqrt(max(0.0, towards @ covariance[3:, 3:] @ towards)))
+    decimals = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, _MOST_DECIMALS))
+    return f"range {range_m:.{decimals}f} ± {sigma:.{decimals}f} m"
+
+
 def _short(name: str) -> str:
     """The end of a long name, which differs more between pictures than its start."""
     return name if len(name) <= _NAME_CHARACTERS else f"...{name[-_NAME_CHARACTERS + 3 :]}"
 
 
-def confidence(estimate: Estimate) -> float | None:
-    """Mean score of the keypoints that the pose agrees with, 0 to 1; None without a pose."""
+def mean_score(estimate: Estimate) -> float | None:
+    """Mean score of the inliers, 0 to 1; None without a pose."""
     if estimate.cam_from_body is None or estimate.keypoints is None:
         return None
     agreed = estimate.keypoints.score if estimate.inliers is None else estimate.keypoints.score[estimate.inliers]
@@ -153,23 +165,27 @@ def _draw_axes(canvas: Canvas, camera: Camera, pose: Pose, diameter_m: float) ->
         canvas.label(name, ends[3 + k], colour)
 
 
-def _draw_keypoints(canvas: Canvas, keypoints: Keypoints, visible: ndarray | None, inliers: ndarray | None) -> None:
-    """A disc where visible, a ring where the spacecraft hides it, a cross where the pose disagrees."""
+def _draw_keypoints(
+    canvas: Canvas, keypoints: Keypoints, visible: Bool[ndarray, " n"] | None, inliers: Bool[ndarray, " n"] | None
+) -> None:
+    """A disc where visible, a ring where hidden, a square where that is not known; a cross for an outlier."""
     for k in np.argsort(keypoints.score):
         if keypoints.score[k] < _LEAST_SCORE:
             continue
         colour = score_colour(float(keypoints.score[k]))
         if inliers is not None and not inliers[k]:
             canvas.cross(keypoints.pixels[k], colour)
-        elif visible is not None and not visible[k]:
-            canvas.ring(keypoints.pixels[k], colour)
-        else:
+        elif visible is None:
+            canvas.square(keypoints.pixels[k], colour)
+        elif visible[k]:
             canvas.disc(keypoints.pixels[k], colour)
+        else:
+            canvas.ring(keypoints.pixels[k], colour)
 
 
-def _draw_box(canvas: Canvas, box: Box) -> None:
-    """The four corners only, which hide nothing."""
-    reach = 0.14 * min(box.x1 - box.x0, box.y1 - box.y0)
+def _draw_box(canvas: Canvas, box: Box, part: float = 0.14) -> None:
+    """The four corners only, which hide nothing; `part` of the shorter side long."""
+    reach = part * min(box.x1 - box.x0, box.y1 - box.y0)
     for x, towards_x in ((box.x0, reach), (box.x1, -reach)):
         for y, towards_y in ((box.y0, reach), (box.y1, -reach)):
             corner = np.array([x, y])
@@ -189,29 +205,41 @@ def _draw_panel(canvas: Canvas, lines: Sequence[str], failed: bool) -> None:
         canvas.text(line, np.array([pad, pad * 0.4 + step * (row + 0.85)]), colour, size, weight)
 
 
-def _draw_legend(canvas: Canvas, with_truth: bool) -> None:
-    """Bottom left: the two line styles, the three marks, and the score's scale."""
-    u, size = canvas.unit, 15.0
-    x, y = 14 * u, canvas.image.shape[0] - 14 * u
-    entries = ["estimate", *(["truth"] if with_truth else []), "visible", "hidden", "rejected"]
-    total = sum(canvas.text_width(entry, size) + 50 * u for entry in entries) + 150 * u
-    canvas.shade(0, y - 24 * u, x + total, canvas.image.shape[0])
-    f = canvas.factor
-    for entry in entries:
-        middle = np.array([x + 12 * u, y - 5 * u]) / f
-        left, right = middle - (12 * u / f, 0), middle + (12 * u / f, 0)
-        if entry == "estimate":
-            canvas.line(left, right, SKY)
-        elif entry == "truth":
-            canvas.dashes(left, right, WHITE)
-        else:
-            marks = {"visible": canvas.disc, "hidden": canvas.ring, "rejected": canvas.cross}
-            marks[entry](middle, score_colour(0.66))
-        canvas.text(entry, np.array([x + 32 * u, y]), WHITE, size, 400)
-        x += canvas.text_width(entry, size) + 50 * u
-    canvas.text("score 0", np.array([x, y]), WHITE, size, 400)
-    x += canvas.text_width("score 0", size) + 8 * u
-    for k in range(round(60 * u)):
-        column = round(x + k)
-        canvas.image[round(y - 11 * u) : round(y), column : column + 1] = score_colour(k / max(1, round(60 * u) - 1))
-    canvas.text("1", np.array([x + 68 * u, y]), WHITE, size, 400)
+def _legend_entries(frame: Frame, estimate: Estimate, with_truth: bool) -> list[Entry]:
+    """The marks that this overlay may have."""
+    entries = []
+    if estimate.cam_from_body is not None:
+        entries.append(Entry("estimate", lambda canvas, left, right: canvas.line(left, right, SKY)))
+        entries.append(Entry("body axes", _axes_icon, 48))
+    if with_truth:
+        entries.append(Entry("truth", lambda canvas, left, right: canvas.dashes(left, right, WHITE)))
+    if estimate.box is not None:
+        entries.append(Entry("box", _box_icon))
+    if estimate.keypoints is not None:
+        known = [("visible", Canvas.disc), ("hidden", Canvas.ring)]
+        marks = [("visibility unknown", Canvas.square)] if frame.visible is None else known
+        marks += [("outlier", Canvas.cross)] if estimate.inliers is not None else []
+        entries += [Entry(text, _mark_icon(mark), 12) for text, mark in marks]
+        entries.append(Entry("keypoint score, 0 to 1", _score_icon, 60))
+    return entries
+
+
+def _mark_icon(mark: Mark) -> Icon:
+    return lambda canvas, left, right: mark(canvas, (left + right) / 2, score_colour(0.66))
+
+
+def _axes_icon(canvas: Canvas, left: Float[ndarray, "2"], right: Float[ndarray, "2"]) -> None:
+    for k, (name, colour) in enumerate(_AXES):
+        canvas.label(name, left + (right - left) * (k + 0.5) / len(_AXES), colour, 16)
+
+
+def _box_icon(canvas: Canvas, left: Float[ndarray, "2"], right: Float[ndarray, "2"]) -> None:
+    middle, reach = (left + right) / 2, 0.25 * (right[0] - left[0])
+    _draw_box(canvas, Box(middle[0] - 1.6 * reach, middle[1] - reach, middle[0] + 1.6 * reach, middle[1] + reach), 0.3)
+
+
+def _score_icon(canvas: Canvas, left: Float[ndarray, "2"], right: Float[ndarray, "2"]) -> None:
+    (start, y), (end, _) = left * canvas.factor, right * canvas.factor
+    for column in range(round(start), round(end)):
+        colour = score_colour((column - start) / (end - start))
+        canvas.image[round(y - 5 * canvas.unit) : round(y + 5 * canvas.unit), column] = colour

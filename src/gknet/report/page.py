@@ -18,6 +18,7 @@ from gknet.report.table import (
     ROWS,
     failure_count,
     interval_text,
+    mean_heading,
     median_text,
     percent_text,
     statistic,
@@ -97,7 +98,7 @@ def _short(found: Statistic | None, digits: int) -> str:
 def _metric_table(evaluation: Evaluation) -> str:
     runs = evaluation.runs
     top = "".join(f'<th colspan="2">{escaped(PROTOCOL_WORDS[run.protocol])}</th>' for run in runs)
-    second = "".join("<th>mean [95 % interval]</th><th>median</th>" for _ in runs)
+    second = "".join(f"<th>{escaped(mean_heading(run, 'interval'))}</th><th>median</th>" for run in runs)
     rows = []
     for row in ROWS:
         if not any(statistic(run, row.metric) for run in runs):
@@ -153,8 +154,9 @@ def _glossary() -> str:
     terms = "".join(f"<dt>{escaped(title)}</dt><dd>{escaped(meaning)}</dd>" for title, meaning in meanings)
     return (
         '<section><h2>How to read this</h2><p>In the pictures the estimate is <span class="estimate">blue</span>, the '
-        "truth white and dashed. Keypoints are coloured by score, from vermillion (0) to pale yellow (1): a disc is "
-        "visible, a ring is hidden by the spacecraft, a cross is left out of the pose. Intervals come from a bootstrap "
-        "over whole sequences.</p>"
+        "truth white and dashed. Pink brackets are the box, arrows the body axes X (red), Y (green) and Z (blue). "
+        "Keypoints are coloured by score, from vermillion (0) to pale yellow (1): a disc is visible, a ring is hidden "
+        "by the spacecraft, a square is of unknown visibility, and a cross is an outlier, which has no part in the "
+        "pose. Intervals come from a bootstrap over whole sequences; a single sequence has none.</p>"
         f"<dl>{terms}</dl></section>"
     )

@@ -78,6 +78,12 @@ def interval_text(found: Statistic | None, digits: int) -> str:
     return mean if found.low is None else f"{mean} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
+def mean_heading(run: ProtocolRun, interval: str = "") -> str:
+    """The heading of a column of `interval_text`; it names the interval where a metric of the run has one."""
+    has_interval = any(found.low is not None for found in run.summary.metrics.values())
+    return f"mean [{f'95 % {interval}'.strip()}]" if has_interval else "mean"
+
+
 def median_text(found: Statistic | None, digits: int) -> str:
     """The median; "-" for None."""
     return "-" if found is None else f"{found.median:.{digits}f}"
@@ -98,7 +104,7 @@ def metric_table(evaluation: Evaluation) -> Table:
     table = _plain_table(printable(f"{evaluation.spacecraft.name}: {evaluation.data}"))
     table.add_column("metric", no_wrap=True)
     for run in evaluation.runs:
-        table.add_column(f"{run.protocol}: mean [95 %]", justify="right", no_wrap=True)
+        table.add_column(f"{run.protocol}: {mean_heading(run)}", justify="right", no_wrap=True)
         table.add_column("median", justify="right", no_wrap=True)
     for row in ROWS:
         found = [statistic(run, row.metric) for run in evaluation.runs]
