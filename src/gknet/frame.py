@@ -181,7 +181,9 @@ class FailureKind(StrEnum):
     """
 
     UNREADABLE_IMAGE = "unreadable_image"
-    """The picture cannot be read, or its camera does not fit it."""
+    """The picture cannot be read."""
+    CAMERA_MISMATCH = "camera_mismatch"
+    """The camera is for pictures of another size."""
     NO_SPACECRAFT = "no_spacecraft"
     """The locator finds no spacecraft in the picture."""
     NO_KEYPOINT_IN_VIEW = "no_keypoint_in_view"
@@ -315,11 +317,11 @@ class PoseEstimator(Protocol):
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A picture that is listed but cannot be read, and why.
+    """A picture that is listed but cannot be used, and why.
 
     Attributes:
         name: The picture's name, as that of a `Frame`.
-        failure: Why it cannot be read; its kind is `unreadable_image` unless there is a better one.
+        failure: Why it cannot be used; its kind is `unreadable_image` unless there is a better one.
     """
 
     name: str

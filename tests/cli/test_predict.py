@@ -83,6 +83,31 @@ def test_one_image(use: Use, pictures: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in leftovers(out)) == ["a.jpg", "poses.jsonl", "prediction.json"]
 
 
+@pytest.mark.parametrize(
+    ("camera", "warned"),
+    [
+        (("--focal-px", "350"), True),
+        (("--camera", "k.txt"), True),
+        (("--hfov-deg", "40"), False),
+        (("--camera", "k.txt", "--camera-size", "256x256", "--scale-camera"), False),
+    ],
+)
+def test_one_focal_length_for_several_sizes_is_a_warning(
+    camera: tuple[str, ...], warned: bool, use: Use, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use(ToyEstimator())
+    matrix = tmp_path / "k.txt"
+    matrix.write_text("350 0 128\n0 350 128\n0 0 1\n")
+    options = [str(matrix) if word == "k.txt" else word for word in camera]
+    (tmp_path / "in").mkdir()
+    for number, size in enumerate((256, 256, 288)):
+        write_image(tmp_path / "in" / f"{number}.png", toy_picture(number, size))
+    assert predict(tmp_path / "in", *MODEL, *options, "--no-overlay", "--out", tmp_path / "out") == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "focal length" in line]
+    assert len(lines) == warned
+    assert all("several sizes, 256x256, 288x288: " in line for line in lines)
+
+
 def test_folder_goes_on_past_bad_pictures(
     use: Use, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

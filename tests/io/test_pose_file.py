@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -53,6 +54,12 @@ def test_record_holds_the_estimate() -> None:
     assert entry["keypoints"][1]["pixel"] == [None, 4]
     assert entry["attitude_confidence"] == 0.75
     assert (entry["inlier_count"], entry["reprojection_rms_px"], entry["box"]) == (1, 0.5, [0, 1, 2, 3])
+
+
+def test_every_kind_of_failure_is_documented() -> None:
+    page = Path(__file__).parents[2] / "docs" / "howto" / "poses-file.md"
+    rows = re.findall(r"^\| `(\w+)` \|", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [row for row in rows if row in set(FailureKind)] == [kind.value for kind in FailureKind]
 
 
 def test_the_time_has_nine_digits_like_every_number() -> None:

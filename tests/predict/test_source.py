@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from gknet.errors import GknetError
-from gknet.frame import Frame, Unreadable
+from gknet.frame import FailureKind, Frame, Unreadable
 from gknet.geometry import Camera
 from gknet.io.image import write_image
 from gknet.io.lens import FieldOfView
@@ -121,12 +121,17 @@ def test_a_live_source_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
         open_source("0", LENS, TOY, limit=0)
 
 
-def test_a_camera_of_another_size_makes_pictures_unreadable(tmp_path: Path) -> None:
+def test_a_camera_of_another_size_is_a_failure_of_its_own_kind(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", toy_picture(0))
     film(tmp_path / "b.mp4", 0)
     for picture in open_source(tmp_path, Camera.from_focal(500, 640, 480), TOY):
         assert isinstance(picture, Unreadable)
+        assert picture.failure.kind == FailureKind.CAMERA_MISMATCH
         assert "640 x 480 pixels, the image has 256 x 256" in picture.failure.detail
+    (tmp_path / "a.png").write_bytes(b"x")
+    damaged_picture = next(iter(open_source(tmp_path / "a.png", LENS, TOY)))
+    assert isinstance(damaged_picture, Unreadable)
+    assert damaged_picture.failure.kind == FailureKind.UNREADABLE_IMAGE
 
 
 def test_no_input_and_no_lens(tmp_path: Path) -> None:

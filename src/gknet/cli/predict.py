@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from gknet.predict.results import PredictionWriter
 
 _SHOWN_FAILURES = 5
+_SHOWN_SIZES = 5
 
 
 class PoseLayout(StrEnum):
@@ -114,6 +116,8 @@ def predict(
     with writer, progress() as bar:
         pictures = bar.track(source, total=source.count, description="poses")
         predict_all(pictures, estimator, writer, given_box, oracle)
+    if lens is not None:
+        warn_of_sizes(lens, list(writer.image_sizes))
     print_summary(writer)
 
 
@@ -178,6 +182,20 @@ def _camera_words(
         "--scale-camera": scale or None,
     }
     return " ".join(f"{option} {value}" for option, value in given.items() if value is not None)
+
+
+def warn_of_sizes(lens: Lens, sizes: Sequence[tuple[int, int]]) -> None:
+    """A warning where one focal length in pixels served pictures of several sizes."""
+    from gknet.io.lens import has_fixed_focal_length
+
+    if len(sizes) < 2 or not has_fixed_focal_length(lens):
+        return
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:_SHOWN_SIZES])
+    more = f" and {len(sizes) - _SHOWN_SIZES} more" if len(sizes) > _SHOWN_SIZES else ""
+    print_warning(
+        f"one focal length in pixels was used for pictures of several sizes, {shown}{more}: it fits one size alone "
+        "unless the others were cut from it; give --hfov-deg, or run each size with its own camera"
+    )
 
 
 def print_summary(writer: PredictionWriter) -> None:

@@ -132,6 +132,11 @@ def camera_for(lens: Lens, width: int, height: int, scale: bool = False) -> Came
     )
 
 
+def has_fixed_focal_length(lens: Lens) -> bool:
+    """Whether pictures of any size get the same focal length in pixels, which is right for one size alone."""
+    return isinstance(lens, MatrixOnly) or (isinstance(lens, FieldOfView) and lens.focal_px is not None)
+
+
 def sized_lens(lens: Lens, size: tuple[int, int] | None, scale: bool) -> Lens:
     """A lens as the options --camera-size and --scale-camera change it.
 

@@ -50,6 +50,7 @@ class PredictionWriter:
         pose_count: Pictures with a pose.
         ambiguous_count: Those of them whose pose is ambiguous.
         failures: The others, each with its reason.
+        image_sizes: Width and height of the pictures of this run, in the order in which they came.
         kept_count: Pictures of an earlier run that was gone on with; they count in the three before.
 
     Raises:
@@ -73,6 +74,7 @@ class PredictionWriter:
         self.video_path = self.folder / "overlay.mp4" if fps is not None else None
         self.pose_count = self.ambiguous_count = self.kept_count = 0
         self.failures: list[Unreadable] = []
+        self.image_sizes: dict[tuple[int, int], None] = {}
         self._spacecraft, self._layout, self._record, self._existing = spacecraft, layout, record, existing
         self._overlays = OverlayFolder(self.overlay_folder) if self.overlay_folder else None
         self._film = OverlayFilm(self.video_path, fps) if self.video_path and fps is not None else None
@@ -111,6 +113,7 @@ class PredictionWriter:
     def add(self, frame: Frame, estimate: Estimate) -> None:
         """Record the answer for one picture; a missing pose is counted and kept with its reason."""
         self._opened().add(frame.name, frame.time_s, estimate)
+        self.image_sizes[frame.camera.width, frame.camera.height] = None
         self._count(frame.name, estimate.failure, estimate.is_ambiguous)
         if self._overlays is None and self._film is None:
             return

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from jaxtyping import UInt8
+from numpy import ndarray
+
 from gknet.dataset.skd import SkdDataset, open_dataset
 from gknet.dataset.skd_format import SPLITS
 from gknet.errors import GknetError
-from gknet.frame import Frame, Unreadable
+from gknet.frame import Failure, FailureKind, Frame, Unreadable
 from gknet.io.image import read_image_file
 from gknet.io.lens import Lens, camera_for
 from gknet.io.text import printable
@@ -68,12 +71,11 @@ class ImageFiles:
                 if file.kind is Kind.BAD:
                     raise GknetError(file.reason)
                 picture = read_image_file(file.path, self.bit_depth)
-                camera = camera_for(self.lens, picture.image.shape[1], picture.image.shape[0])
                 more_pages = picture.has_more_pages
             except GknetError as error:
                 yield Unreadable.because(file.name, printable(error))
             else:
-                yield Frame(file.name, picture.image, camera)
+                yield _frame(file.name, picture.image, self.lens)
             if more_pages:
                 reason = "only the first page (or picture of the animation) was read; save the others as files"
                 yield Unreadable.because(f"{file.name}: further pages", f"{printable(file.path)}: {reason}")
@@ -107,7 +109,7 @@ class VideoFile:
         name, read = self.name or printable(self.video.path.stem), 0
         for shown in self.video.frames(self.every):
             read = shown.index + self.every
-            yield _frame(shown, f"{name}/{shown.index:06d}", self.video.path, self.lens)
+            yield _video_frame(shown, f"{name}/{shown.index:06d}", self.video.path, self.lens)
         if missing := self.video.missing_at_the_end(read):
             announced, path = self.video.announced, printable(self.video.path)
             reason = f"{path}: the last {missing} of {announced} frames cannot be read; is the video truncated?"
@@ -140,18 +142,22 @@ class LiveFrames:
 
     def __iter__(self) -> Iterator[Frame | Unreadable]:
         for shown in self.video.frames(self.every):
-            yield _frame(shown, f"{self.name}/{shown.index:06d}", self.name, self.lens)
+            yield _video_frame(shown, f"{self.name}/{shown.index:06d}", self.name, self.lens)
 
 
-def _frame(shown: VideoFrame, name: str, place: object, lens: Lens) -> Frame | Unreadable:
-    """A frame of a video with the camera of its size."""
+def _video_frame(shown: VideoFrame, name: str, place: object, lens: Lens) -> Frame | Unreadable:
     if shown.image is None:
         return Unreadable.because(name, f"{printable(place)}: frame {shown.index} cannot be decoded")
+    return _frame(name, shown.image, lens, shown.time_s)
+
+
+def _frame(name: str, image: UInt8[ndarray, "h w 3"], lens: Lens, time_s: float | None = None) -> Frame | Unreadable:
+    """A picture with the camera of its size."""
     try:
-        camera = camera_for(lens, shown.image.shape[1], shown.image.shape[0])
+        camera = camera_for(lens, image.shape[1], image.shape[0])
     except GknetError as error:
-        return Unreadable.because(name, printable(error))
-    return Frame(name, shown.image, camera, time_s=shown.time_s)
+        return Unreadable(name, Failure(FailureKind.CAMERA_MISMATCH, printable(error)))
+    return Frame(name, image, camera, time_s=time_s)
 
 
 @dataclass(frozen=True)
