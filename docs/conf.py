@@ -78,6 +78,11 @@ def with_whole_summaries(text: str) -> str:
     return text
 
 
+def without_markup(text: str) -> str:
+    """The text with <name> as it is written, where Markdown would take it for a tag of HTML; code stays."""
+    return re.sub(r"(`[^`\n]*`)|<(?=\w+>)", lambda found: found[1] or r"\<", text)
+
+
 def write_command_reference(app: Sphinx) -> None:
     """reference/commands.md from the help texts of the command line, by typer's own tool."""
     target = DOCS / "reference" / "commands.md"
@@ -85,7 +90,7 @@ def write_command_reference(app: Sphinx) -> None:
     run = subprocess.run([sys.executable, *tool], capture_output=True, text=True, check=True)
     introduction = "Made from the help texts of the program: `gknet --help` and `gknet COMMAND --help` print the same."
     text = run.stdout.replace("# Commands\n", f"# Commands\n\n{introduction}\n", 1).replace("&#x27;", "'")
-    text = with_whole_summaries(text)
+    text = without_markup(with_whole_summaries(text))
     if not target.is_file() or target.read_text(encoding="utf-8") != text:
         target.write_text(text, encoding="utf-8")
 

@@ -78,7 +78,7 @@ def table(results: Path, recipe: str) -> str:
         for words in PROTOCOLS:
             run = figures(results, name, recipe, words)
             located = "" if words == "oracle crop" else f"{100 * run['located_07']:.1f} %"
-            cells = [name, SHORT[words], f"{sum(run['failures'].values())} of {run['frames']}"]
+            cells = [name, SHORT[words], str(sum(run["failures"].values()))]
             cells += [mean_median(run["metrics"][column]) for column in shown]
             lines.append("| " + " | ".join([*cells, f"{100 * run['coverage_95']:.0f} %", located]) + " |")
     return "\n".join(lines)
@@ -186,7 +186,8 @@ def main() -> None:
     for name in NAMES:
         write_text(arguments.models / name / "README.md", card(arguments.models, arguments.results, name))
     for recipe in ("skd", "skd-hard"):
-        print(f"\n{recipe}: mean (median)\n\n{table(arguments.results, recipe)}")
+        frames = figures(arguments.results, NAMES[0], recipe)["frames"]
+        print(f"\n{recipe}, {frames} frames each: mean (median)\n\n{table(arguments.results, recipe)}")
         print(f"\n{recipe}, by background: frames, RMSE px\n\n{background_table(arguments.results, NAMES, recipe)}")
         confidence = confidence_table(arguments.results, NAMES, recipe)
         print(f"\n{recipe}, by attitude_confidence: frames, E_q rad\n\n{confidence}")

@@ -46,8 +46,10 @@ def test_equations_are_mathml(site: Path) -> None:
 @pytest.mark.slow
 def test_every_command_is_in_the_reference(site: Path) -> None:
     text = re.sub(r"<[^>]+>", "", (site / "reference" / "commands.html").read_text(encoding="utf-8"))
-    for command in options():
+    for command, words in options().items():
         assert f"gknet {command}" in text
+        assert all(word in text for word in words if word.startswith("--"))  # as they are typed, with two hyphens
+    assert "OUT/&lt;name&gt;.glb" in text
 
 
 def test_the_whole_public_api_is_in_the_reference() -> None:
