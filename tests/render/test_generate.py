@@ -25,6 +25,7 @@ from gknet.io.image import read_image, read_mask
 from gknet.io.spacecraft_file import save_spacecraft
 from gknet.render import generate as stage
 from gknet.render import worker
+from gknet.render.contact_sheet import TILE_PX
 from gknet.render.journal import JOURNAL, append_row
 from gknet.render.options import Options, Selection, parse_shard
 from gknet.render.plan import FILM_SIZES, plan_sequences, target_window
@@ -328,7 +329,7 @@ def test_recipe_json_records_what_the_folder_is(tmp_path: Path) -> None:
     run(tmp_path, sequences=1, frames=1)
     recorded = json.loads((tmp_path / "recipe.json").read_text())
     assert (recorded["seed"], recorded["window"], recorded["recipe"]["name"]) == (5, "frame", "skd")
-    assert read_image(tmp_path / "contact_sheet.jpg").shape[1] == 3 * 256
+    assert read_image(tmp_path / "contact_sheet.jpg").shape[1] == 3 * TILE_PX
 
 
 def test_a_reader_of_the_authors_rules_finds_the_keypoints_in_our_pictures(tmp_path: Path) -> None:

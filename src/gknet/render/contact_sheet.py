@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
@@ -14,19 +13,24 @@ from gknet.errors import GknetError
 from gknet.frame import Frame
 from gknet.inference.crop import Crop
 from gknet.io.image import write_image
+from gknet.report.canvas import Canvas
+from gknet.report.legend import Entry, legend_strip
+from gknet.report.palette import WHITE
 from gknet.spacecraft import Spacecraft
 
-TILE_PX = 256
-COLUMNS = 8
-TILES = 40
+TILE_PX = 320
+COLUMNS = 6
+TILES = 36
+TEXT_PX = 15.0
+MARK_PX = 3.0
 VISIBLE, HIDDEN, EDGE = (80, 255, 80), (255, 90, 60), (90, 160, 255)
-SUBPIXEL_BITS = 4
 
 
 def write_contact_sheet(root: str | Path, tiles: int = TILES) -> Path | None:
     """Write contact_sheet.jpg: frames spread over the spacecraft and sequences of a rendered folder.
 
-    Visible keypoints are green dots, hidden ones red rings.
+    Each tile shows the true skeleton in blue, visible keypoints as green discs, hidden ones and those out of view as
+    red rings, and states its frame, spacecraft and range. A strip below explains the marks.
 
     Args:
         root: The dataset's folder.
@@ -43,7 +47,7 @@ def write_contact_sheet(root: str | Path, tiles: int = TILES) -> Path | None:
     pictures += [np.zeros_like(pictures[0])] * (-len(pictures) % columns)
     rows = [np.concatenate(pictures[i : i + columns], axis=1) for i in range(0, len(pictures), columns)]
     path = root / "contact_sheet.jpg"
-    write_image(path, np.concatenate(rows), quality=90)
+    write_image(path, np.concatenate([*rows, _legend(rows[0].shape[1])]), quality=90)
     return path
 
 
@@ -65,27 +69,32 @@ def _tile(frame: Frame, spacecraft: Spacecraft) -> UInt8[ndarray, "t t 3"]:
     if frame.image is None:
         raise GknetError(f"frame {frame.name}: it was read without its image")
     window = Crop(0, 0, max(frame.camera.width, frame.camera.height), TILE_PX)
-    picture = window.cut(frame.image)
+    canvas = Canvas(np.ascontiguousarray(window.cut(frame.image)), weight=1024 / TILE_PX)  # a unit is a pixel
     pixels = window.to_input(frame.keypoints_px(spacecraft.points_m))
-    ends = [_fixed(point) for point in pixels]
     for i, j in spacecraft.edges:
-        start, stop = ends[i], ends[j]
-        if start and stop:
-            cv2.line(picture, start, stop, EDGE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
-    for k, end in enumerate(ends):
-        is_visible = frame.visible is None or frame.visible[k]
-        if end:
-            radius = round(2.2 * 2**SUBPIXEL_BITS)
-            colour, width = (VISIBLE, cv2.FILLED) if is_visible else (HIDDEN, 1)
-            cv2.circle(picture, end, radius, colour, width, cv2.LINE_AA, SUBPIXEL_BITS)
-    label = f"{frame.name}  {frame.range_m:.1f} m"
-    cv2.putText(picture, label, (4, TILE_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (255, 255, 0), 1, cv2.LINE_AA)
-    return picture
+        canvas.line(pixels[i], pixels[j], EDGE, 1, outlined=False)
+    for k, pixel in enumerate(pixels):
+        if frame.visible is None or frame.visible[k]:
+            canvas.disc(pixel, VISIBLE, MARK_PX)
+        else:
+            canvas.ring(pixel, HIDDEN, MARK_PX, 1)
+    lines = [frame.name, f"{spacecraft.name}, {frame.range_m:.1f} m"]
+    width = max(canvas.text_width(line, TEXT_PX) for line in lines)
+    canvas.shade(0, TILE_PX - 2.6 * TEXT_PX, width + TEXT_PX, TILE_PX)
+    for row, line in enumerate(lines):
+        canvas.text(line, np.array([0.5 * TEXT_PX, TILE_PX - (1.55 - 1.15 * row) * TEXT_PX]), WHITE, TEXT_PX)
+    return canvas.image
 
 
-def _fixed(point: ndarray) -> tuple[int, int] | None:
-    """OpenCV's fixed-point pixels, whose centres are at whole numbers; None for a point too far out to draw."""
-    if not (np.isfinite(point).all() and np.abs(point).max() < 8 * TILE_PX):
-        return None
-    x, y = np.round((point - 0.5) * 2**SUBPIXEL_BITS).astype(int)
-    return int(x), int(y)
+def _legend(width_px: int) -> UInt8[ndarray, "h w 3"]:
+    """What the marks of the tiles mean."""
+    return legend_strip(
+        width_px,
+        (
+            Entry("true skeleton", lambda canvas, left, right: canvas.line(left, right, EDGE)),
+            Entry("visible keypoint", lambda canvas, left, right: canvas.disc((left + right) / 2, VISIBLE), 12),
+            Entry("hidden or out of view", lambda canvas, left, right: canvas.ring((left + right) / 2, HIDDEN), 12),
+            Entry("text: sequence/frame, spacecraft, range", lambda canvas, left, right: None, 0),
+        ),
+        weight=1.1 * 1024 / width_px,
+    )

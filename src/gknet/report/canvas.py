@@ -67,12 +67,15 @@ class Canvas:
     def _raw_line(self, a: Float[ndarray, "2"], b: Float[ndarray, "2"], colour: RGB, width: int) -> None:
         cv2.line(self.image, self._fixed(a), self._fixed(b), colour, width, cv2.LINE_AA, _SHIFT)
 
-    def line(self, a: Float[ndarray, "2"], b: Float[ndarray, "2"], colour: RGB, width: float = 2.0) -> None:
+    def line(
+        self, a: Float[ndarray, "2"], b: Float[ndarray, "2"], colour: RGB, width: float = 2.0, outlined: bool = True
+    ) -> None:
         """A segment from `a` to `b`, each (2,) in px; nothing when an end is not finite or far away."""
         if not self._drawable(a, b):
             return
         inner = self._width(width)
-        self._raw_line(a, b, INK, inner + 2 * self._width(1))
+        if outlined:
+            self._raw_line(a, b, INK, inner + 2 * self._width(1))
         self._raw_line(a, b, colour, inner)
 
     def dashes(self, a: Float[ndarray, "2"], b: Float[ndarray, "2"], colour: RGB, width: float = 1.2) -> None:

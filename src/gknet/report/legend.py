@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from gknet.report.canvas import Canvas
@@ -54,6 +54,24 @@ def draw_legend(canvas: Canvas, entries: Sequence[Entry]) -> None:
             entry.icon(canvas, left / canvas.factor, right / canvas.factor)
             canvas.text(entry.text, np.array([right[0] + 8 * unit, y]), WHITE, _TEXT, 400)
             x += entry.room(canvas)
+
+
+def legend_strip(width_px: int, entries: Sequence[Entry], weight: float) -> UInt8[ndarray, "h w 3"]:
+    """A legend as a picture of its own, as high as its rows need.
+
+    Args:
+        width_px: Of the strip.
+        entries: In their order.
+        weight: Of marks and text, see `Canvas`.
+
+    Returns:
+        (h, width_px, 3) RGB.
+    """
+    canvas = Canvas(np.zeros((1, width_px, 3), dtype=np.uint8), weight=weight)
+    rows = len(_rows(canvas, entries, width_px - _EDGE * canvas.unit))
+    canvas.image = np.zeros((round((_ROW * rows + _EDGE) * canvas.unit), width_px, 3), dtype=np.uint8)
+    draw_legend(canvas, entries)
+    return canvas.image
 
 
 def _rows(canvas: Canvas, entries: Sequence[Entry], width: float) -> list[list[Entry]]:
