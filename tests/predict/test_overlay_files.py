@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gknet.io.video import open_video
-from gknet.predict.overlay_files import OverlayFilm, OverlayFolder, OverlayNames
+from gknet.predict.overlay_files import OverlayFolder, OverlayNames, OverlayVideo
 
 PICTURE = np.zeros((64, 64, 3), dtype=np.uint8)
 
@@ -64,7 +64,7 @@ def test_an_overlay_that_cannot_be_written_is_counted(tmp_path: Path, capfd: pyt
 
 
 def test_a_frame_that_the_codec_refuses_ends_no_film(tmp_path: Path) -> None:
-    film = OverlayFilm(tmp_path / "overlay.mp4", 5)
+    film = OverlayVideo(tmp_path / "overlay.mp4", 5)
     film.write("wide", np.zeros((20, 100_000, 3), dtype=np.uint8))
     for _ in range(3):
         film.write("good", PICTURE)
@@ -75,7 +75,7 @@ def test_a_frame_that_the_codec_refuses_ends_no_film(tmp_path: Path) -> None:
 
 
 def test_a_film_without_frames_leaves_nothing(tmp_path: Path) -> None:
-    film = OverlayFilm(tmp_path / "none" / "overlay.mp4", 5)
+    film = OverlayVideo(tmp_path / "none" / "overlay.mp4", 5)
     film.write("good", PICTURE)
     film.close()
     assert film.losses.count == 1

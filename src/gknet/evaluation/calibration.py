@@ -62,22 +62,22 @@ class CalibrationSample:
         return estimator.pose_of(self.decoded(estimator.decoding), self.frame.camera, self.box, self.crop)
 
 
-def collect_sample(frame: Frame, bare: KeypointEstimator, stride: float) -> CalibrationSample:
+def collect_sample(frame: Frame, uncalibrated: KeypointEstimator, stride: float) -> CalibrationSample:
     """Detect the keypoints in a frame's oracle crop.
 
     Args:
         frame: With its image and true pose.
-        bare: An estimator whose decoding is `UNCALIBRATED`.
+        uncalibrated: An estimator whose decoding is `UNCALIBRATED`.
         stride: Input pixels per cell of its network.
 
     Raises:
         GknetError: No keypoint is in view, or the frame has no image.
     """
-    box = frame.true_box(bare.spacecraft.points_m)
+    box = frame.true_box(uncalibrated.spacecraft.points_m)
     if box is None:
         raise GknetError(f"frame {frame.name}: no keypoint is in view, so there is nothing to calibrate on")
-    crop = Crop.around(box, bare.settings.input_size)
-    keypoints, _ = bare.detect(check_image(frame.image), crop)
+    crop = Crop.around(box, uncalibrated.settings.input_size)
+    keypoints, _ = uncalibrated.detect(check_image(frame.image), crop)
     return CalibrationSample(replace(frame, image=None), box, crop, keypoints, crop.scale / stride)
 
 

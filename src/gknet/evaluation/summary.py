@@ -91,8 +91,8 @@ class Summary:
         sequences: How many sequences.
         failures: Frames without a pose for each kind of failure, the most frequent first.
         metrics: Metric -> statistic; a metric that no frame has is absent.
-        located_07: Part of the frames whose box overlaps the true one by an IoU of 0.7 or more.
-        coverage_68: Part of the poses whose error lies in the 68 % ellipsoid of their 6x6 covariance.
+        located_07: Fraction of the frames whose box overlaps the true one by an IoU of 0.7 or more.
+        coverage_68: Fraction of the poses whose error lies in the 68 % ellipsoid of their 6x6 covariance.
         coverage_95: The same of the 95 % ellipsoid.
         bins: By range, phase angle, visibility, the Earth and attitude confidence.
     """
@@ -139,7 +139,7 @@ def summarise(frame_errors: Sequence[FrameErrors], seed: int = 0, resamples: int
 
 
 def _coverage(squared: Float[ndarray, " k"], part: float) -> float | None:
-    """The part of the true poses inside the ellipsoid that should hold `part` of them."""
+    """The fraction of the true poses inside the ellipsoid that should hold `part` of them."""
     return float((squared <= chi2.ppf(part, 6)).mean()) if len(squared) else None
 
 

@@ -69,8 +69,8 @@ def stale_temporaries(folder: str | Path, name: str | None = None) -> list[Path]
     """Temporary files in a folder that killed writers left behind.
 
     Args:
-        folder: Where to look, not in its sub-folders. The caller holds the folder's lock; without it a file may belong
-            to a writer at work.
+        folder: Where to search, without its sub-folders. The caller holds the folder's lock; otherwise a file may
+            belong to a writer at work.
         name: Only those for a file of this name.
     """
     start = "" if name is None else re.escape(name[:_NAME_CHARACTERS])

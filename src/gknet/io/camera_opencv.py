@@ -2,7 +2,7 @@
 
 The files are parsed by a YAML, XML or JSON library: cv2.FileStorage itself can crash on a damaged file. The names of
 the values differ between programs, so camera_matrix, cameraMatrix, K and so on are the same here. OpenCV's pixel
-centres are integers, so 0.5 is added to the principal point. A file does not say whether its four coefficients are
+centres are integers, so 0.5 is added to the principal point. A file does not state whether its four coefficients are
 those of a fisheye, unless it has a fisheye_model as the calibration sample writes it.
 """
 

@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM (clusters) and SIGHUP (a closed terminal), which all mean: keep what there is, and end.
 
 The command line turns the last two into a KeyboardInterrupt (`as_keyboard_interrupt`). A loop whose steps must not be
-cut in the middle opens an `Interruption` and looks at its flag between two steps:
+cut in the middle opens an `Interruption` and checks its flag between two steps:
 
     with Interruption() as interruption:
         for item in items:

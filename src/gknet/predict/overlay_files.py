@@ -1,4 +1,4 @@
-"""Overlay pictures and the overlay film of a run. What cannot be written is counted, and costs nothing else."""
+"""Overlay pictures and the overlay video of a run. What cannot be written is counted, and costs nothing else."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ class OverlayFolder:
 
 
 @dataclass
-class OverlayFilm:
-    """Writes overlay.mp4. A frame that the codec refuses ends the film, and what was filmed before is kept."""
+class OverlayVideo:
+    """Writes overlay.mp4. A frame that the codec refuses ends the video, and the frames before it are kept."""
 
     path: Path
     fps: float
@@ -113,7 +113,7 @@ class OverlayFilm:
                 self._writer = VideoWriter(self.path, self.fps).__enter__()
             with quiet():
                 self._writer.write(picture)
-        except Exception as error:  # whatever goes wrong with the film costs no pose
+        except Exception as error:  # whatever goes wrong with the video costs no pose
             self.losses.note(name, error)
 
     def close(self) -> None:

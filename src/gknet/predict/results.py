@@ -1,4 +1,4 @@
-"""The results of a run over many pictures: poses as text, overlay pictures and an overlay film."""
+"""The results of a run over many pictures: poses as text, overlay pictures and an overlay video."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gknet.io.atomic import output_folder, stale_temporaries
 from gknet.io.lock import LOCK_NAME, locked
 from gknet.io.pose_file import PoseFormat, PoseLine, PoseWriter, read_poses
 from gknet.io.text import printable
-from gknet.predict.overlay_files import Losses, OverlayFilm, OverlayFolder, OverlayNames
+from gknet.predict.overlay_files import Losses, OverlayFolder, OverlayNames, OverlayVideo
 from gknet.predict.run_record import RECORD_NAME, RunRecord, load_record
 from gknet.report.overlay import draw_overlay
 from gknet.spacecraft import Spacecraft
 
 STILLS_FPS = 10.0
-"""The rate of a film made of single images."""
+"""The rate of a video made of single images."""
 
 LAYOUTS: tuple[PoseFormat, ...] = ("jsonl", "csv")
 
@@ -32,21 +32,21 @@ Existing = Literal["same", "resume", "overwrite"]
 class PredictionWriter:
     """Takes estimates one by one. However its `with` block ends, the poses that were added are in the file then.
 
-    Overlays and the film end apart from the poses: what cannot be drawn or written is counted in `losses`.
+    Overlays and the video end apart from the poses: what cannot be drawn or written is counted in `losses`.
 
     Args:
         folder: For the results; made where it is absent, and locked while the block lasts.
         spacecraft: Whose poses they are.
         layout: Of the poses: poses.jsonl or poses.csv.
         overlays: Write overlays/<name>.jpg.
-        fps: Frames/s of overlay.mp4; None writes no film.
+        fps: Frames/s of overlay.mp4; None writes no video.
         record: What the poses depend on; kept as prediction.json. None replaces whatever is there.
         existing: What may happen to results that the folder holds already.
 
     Attributes:
         poses_path: The file of poses.
         overlay_folder: Of the overlays; None when there are none.
-        video_path: The film; None when there is none.
+        video_path: The video; None when there is none.
         pose_count: Pictures with a pose.
         ambiguous_count: Those of them whose pose is ambiguous.
         failures: The others, each with its reason.
@@ -77,7 +77,7 @@ class PredictionWriter:
         self.image_sizes: dict[tuple[int, int], None] = {}
         self._spacecraft, self._layout, self._record, self._existing = spacecraft, layout, record, existing
         self._overlays = OverlayFolder(self.overlay_folder) if self.overlay_folder else None
-        self._film = OverlayFilm(self.video_path, fps) if self.video_path and fps is not None else None
+        self._video = OverlayVideo(self.video_path, fps) if self.video_path and fps is not None else None
         self._undrawn = Losses("overlay")
         self._kept: Counter[str] = Counter()
         self._stack = ExitStack()
@@ -100,7 +100,7 @@ class PredictionWriter:
     @property
     def losses(self) -> list[str]:
         """A sentence for each kind of thing that could not be written, other than poses."""
-        found = [self._undrawn, *(output.losses for output in (self._overlays, self._film) if output is not None)]
+        found = [self._undrawn, *(output.losses for output in (self._overlays, self._video) if output is not None)]
         return [loss.sentence for loss in found if loss.sentence is not None]
 
     def is_kept(self, name: str) -> bool:
@@ -115,14 +115,14 @@ class PredictionWriter:
         self._opened().add(frame.name, frame.time_s, estimate)
         self.image_sizes[frame.camera.width, frame.camera.height] = None
         self._count(frame.name, estimate.failure, estimate.is_ambiguous)
-        if self._overlays is None and self._film is None:
+        if self._overlays is None and self._video is None:
             return
         try:
             picture = draw_overlay(frame, self._spacecraft, estimate)
         except Exception as error:  # whatever goes wrong with a drawing costs no pose
             self._undrawn.note(frame.name, error)
             return
-        for output in (self._overlays, self._film):
+        for output in (self._overlays, self._video):
             if output is not None:
                 output.write(frame.name, picture)
 
@@ -145,8 +145,8 @@ class PredictionWriter:
                 self._record.save(self.folder)
             names = self._spacecraft.keypoint_names
             self._poses = self._stack.enter_context(PoseWriter(self.poses_path, names, self._layout, kept))
-            if self._film is not None:
-                self._stack.callback(self._film.close)
+            if self._video is not None:
+                self._stack.callback(self._video.close)
         return self._poses
 
     def _settle_with_existing(self) -> None:
