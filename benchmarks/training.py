@@ -19,6 +19,9 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
+import gknet.io.openmp  # noqa: F401 (before torch)
+
+# isort: split
 import cv2
 import numpy as np
 import torch

@@ -74,7 +74,8 @@ def with_whole_summaries(text: str) -> str:
     """The reference with the first sentence of each command in its list, which typer's tool cuts at 45 characters."""
     for name, command in get_command(gknet_app).commands.items():  # type: ignore[attr-defined]
         summary = " ".join((command.help or "").split("\n\n")[0].split())
-        text = re.sub(rf"^\* `{name}`: .*$", lambda _, n=name, s=summary: f"* `{n}`: {s}", text, flags=re.MULTILINE)
+        line = f"* `{name}`: {summary}".replace("\\", "\\\\")
+        text = re.sub(rf"^\* `{name}`: .*$", line, text, flags=re.MULTILINE)
     return text
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -38,8 +39,8 @@ def canvas(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str = INK, **style: object) -> None:
-    options: dict[str, object] = {
+def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str = INK, **style: Any) -> None:
+    options: dict[str, Any] = {
         "arrowstyle": "-|>",
         "mutation_scale": 11,
         "linewidth": 1.3,
@@ -49,11 +50,12 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colo
     axes.add_patch(FancyArrowPatch(start, end, color=colour, **(options | style)))
 
 
-def note(axes: Axes, x: float, y: float, text: str, **style: object) -> None:
-    axes.text(x, y, text, **({"ha": "center", "va": "center", "fontsize": 9, "color": INK} | style))
+def note(axes: Axes, x: float, y: float, text: str, **style: Any) -> None:
+    options: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "color": INK}
+    axes.text(x, y, text, **(options | style))
 
 
-def label(axes: Axes, place: np.ndarray | tuple[float, float], text: str, **style: object) -> None:
+def label(axes: Axes, place: np.ndarray | tuple[float, float], text: str, **style: Any) -> None:
     note(axes, float(place[0]), float(place[1]), text, **style)
 
 
@@ -199,7 +201,7 @@ def crop() -> Figure:
     def on_paper(x: float, y: float) -> tuple[float, float]:
         return left + x * unit, top - y * unit
 
-    def square(x0: float, y0: float, wide: float, high: float, **style: object) -> None:
+    def square(x0: float, y0: float, wide: float, high: float, **style: Any) -> None:
         corner = on_paper(x0, y0 + high)
         axes.add_patch(Rectangle(corner, wide * unit, high * unit, **style))
 

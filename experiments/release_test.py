@@ -25,7 +25,7 @@ import numpy as np
 from gknet import __version__, load_estimator
 from gknet.dataset.skd import SkdDataset, open_dataset
 from gknet.errors import GknetError, ends_in_one_line
-from gknet.evaluation.evaluate import Evaluation, evaluate
+from gknet.evaluation.evaluate import Evaluation, ProtocolRun, evaluate
 from gknet.fleet import NAMES
 from gknet.io.atomic import write_text
 from gknet.io.text import read_json
@@ -38,6 +38,12 @@ RESULTS = Path(__file__).parents[1] / "results/release_test"
 MANIFEST = "manifest.json"
 DECIMALS = 5
 """Of the labels that are compared: 10 micrometres, and what rounding on another processor does not reach."""
+
+WRONG_RAD = 0.35
+"""An attitude that is off by more is wrong: it belongs to a symmetric counterpart, or to nothing."""
+
+CONFIDENCES = (0.5, 0.8)
+"""Attitude confidences below which wrong attitudes are counted."""
 
 SHOWN = {"rmse_px": "RMSE px", "e_t": "E_t", "e_q_rad": "E_q rad"}
 
@@ -90,9 +96,22 @@ def judge(work: Path, out: Path) -> list[Evaluation]:
         found.append(evaluate(dataset, estimator, data=words))
     out.mkdir(parents=True, exist_ok=True)
     for name, evaluation in zip(NAMES, found, strict=True):
-        content = {"gknet": __version__, **evaluation.to_dict()}
+        wrong = {run.protocol: wrong_attitudes(run) for run in evaluation.runs}
+        content = {"gknet": __version__, **evaluation.to_dict(), "wrong_attitudes": wrong}
         write_text(out / f"{name}.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     return found
+
+
+def wrong_attitudes(run: ProtocolRun) -> dict[str, int]:
+    """Poses whose attitude is wrong, and how many of them, and of the others, have a low attitude confidence."""
+    errors = [case.errors for case in run.cases if case.errors.failure is None]
+    wrong = np.array([error.e_q_rad > WRONG_RAD for error in errors])
+    confidence = np.array([1.0 if error.attitude_confidence is None else error.attitude_confidence for error in errors])
+    counts = {"poses": len(errors), "wrong": int(wrong.sum())}
+    for limit in CONFIDENCES:
+        counts[f"wrong_below_{limit}"] = int((wrong & (confidence < limit)).sum())
+        counts[f"right_below_{limit}"] = int((~wrong & (confidence < limit)).sum())
+    return counts
 
 
 def check_unjudged(out: Path, again: bool) -> None:

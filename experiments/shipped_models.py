@@ -28,6 +28,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
+import gknet.io.openmp  # noqa: F401 (before torch)
+
+# isort: split
 import torch
 from torch import Tensor
 

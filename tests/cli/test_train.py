@@ -91,7 +91,9 @@ def test_a_pickle_is_never_run(finished: Path, data: Path, refused: Refused, tmp
 
 
 @pytest.mark.parametrize("content", [[], {}, {"identity": "x"}, "text"])
-def test_a_checkpoint_of_something_else(content: object, finished: Path, toy: Path, refused: Refused, tmp_path: Path):
+def test_a_checkpoint_of_something_else(
+    content: object, finished: Path, toy: Path, refused: Refused, tmp_path: Path
+) -> None:
     shutil.copytree(finished, tmp_path / "run")
     torch.save(content, tmp_path / "run" / CHECKPOINT)
     assert CHECKPOINT in refused("train", toy, "--out", tmp_path / "run", *NETWORK, "--resume")
@@ -104,7 +106,8 @@ def test_a_checkpoint_without_its_parts(finished: Path, toy: Path, refused: Refu
         torch.save({name: value for name, value in whole.items() if name != part}, tmp_path / part / CHECKPOINT)
         if part != "cuda_rng":
             assert CHECKPOINT in refused("train", toy, "--out", tmp_path / part, *NETWORK, "--resume")
-    wrong = [{part: 5} for part in whole] + [{"network": {}}, {"state": {"steps": 3, "speed": 5}}]
+    wrong: list[dict[str, object]] = [{"network": {}}, {"state": {"steps": 3, "speed": 5}}]
+    wrong += [{part: 5} for part in whole]
     for parts in wrong:
         if "cuda_rng" not in parts:
             torch.save({**whole, **parts}, tmp_path / "network" / CHECKPOINT)
@@ -126,7 +129,9 @@ def test_a_checkpoint_without_its_parts(finished: Path, toy: Path, refused: Refu
         ("data", 7),
     ],
 )
-def test_a_run_json_of_something_else(key: str, value: object, finished: Path, refused: Refused, tmp_path: Path):
+def test_a_run_json_of_something_else(
+    key: str, value: object, finished: Path, refused: Refused, tmp_path: Path
+) -> None:
     shutil.copytree(finished, tmp_path / "run")
     content = json.loads((finished / "run.json").read_text())
     (tmp_path / "run" / "run.json").write_text(json.dumps({**content, key: value}))

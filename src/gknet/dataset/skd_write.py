@@ -39,6 +39,8 @@ def write_camera_matrix(path: Path, camera: Camera) -> None:
 
 def _write_torch_skeleton(path: Path, edges: list[tuple[int, int]]) -> None:
     """The authors' pickle, where torch is installed; skeleton.json has the same content without it."""
+    import gknet.io.openmp  # noqa: F401 (before torch)
+
     try:
         import torch
     except ImportError:

@@ -21,6 +21,8 @@ def load_torch_file(path: Path) -> object:
         GknetError: The file cannot be read, or holds anything else.
         MissingExtraError: torch is not installed.
     """
+    import gknet.io.openmp  # noqa: F401 (before torch)
+
     try:
         import torch
     except ImportError as error:
