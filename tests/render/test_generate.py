@@ -195,8 +195,10 @@ def test_a_killed_job_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(worker, "render_frame", paint)
     result = run(tmp_path / "cut", sequences=1)
     assert (result.kept, result.rendered) == (7, 11)
+    assert 0 < result.render_seconds < result.seconds
     assert everything(tmp_path / "cut") == everything(tmp_path / "whole")
-    assert run(tmp_path / "cut", sequences=1).rendered == 0
+    again = run(tmp_path / "cut", sequences=1)
+    assert (again.rendered, again.render_seconds) == (0, 0)
 
 
 def test_a_bad_frame_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

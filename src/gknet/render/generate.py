@@ -107,9 +107,13 @@ def generate(
     kept = sum(len(plan.indices) for plan in plans) - todo
     for name in sorted({plan.spacecraft for plan in missing if plan.indices}):
         load_mesh(fleet[name])
-    render_started = time.monotonic()
-    failures = _render(job, missing, fleet, workers, variant or choose_variant(), on_progress) if todo else ()
-    render_seconds = time.monotonic() - render_started if todo else 0.0
+    failures: tuple[str, ...] = ()
+    render_seconds = 0.0
+    if todo:
+        variant = variant or choose_variant()
+        render_started = time.monotonic()
+        failures = _render(job, missing, fleet, workers, variant, on_progress)
+        render_seconds = time.monotonic() - render_started
     with folder_lock(job.root):
         write_splits(job.root, job.recipe.split_of, job.recipe.spacecraft_of)
     write_contact_sheet(job.root)
