@@ -101,7 +101,7 @@ def craft_of(mesh: Path) -> Spacecraft:
 
 def main(
     mesh: Annotated[Path, typer.Argument(help="a GLB, such as `gknet fleet FOLDER` writes")],
-    size: Annotated[int, typer.Option(help="pixels of the picture's side")] = 1024,
+    size: Annotated[int, typer.Option(help="pixels of the image's side")] = 1024,
     spp: Annotated[int, typer.Option(help="samples a pixel")] = 8,
     frames: Annotated[int, typer.Option(help="frames to time")] = 8,
     span: Annotated[float, typer.Option(help="part of the frame that the mesh spans")] = 0.6,
@@ -122,8 +122,8 @@ def main(
     for column in ("", "median s/frame", "ratio"):
         table.add_column(column, justify="right" if column else "left")
     mine, theirs = np.median(seconds[2:], axis=0)
-    table.add_row("bare Mitsuba, picture only", f"{theirs:.3f}", "1.00")
-    table.add_row("gknet, picture and labels", f"{mine:.3f}", f"{mine / theirs:.2f}")
+    table.add_row("bare Mitsuba, image only", f"{theirs:.3f}", "1.00")
+    table.add_row("gknet, image and labels", f"{mine:.3f}", f"{mine / theirs:.2f}")
     Console().print(table)
 
 

@@ -5,7 +5,7 @@
 "bare" is forward, loss, backward and AdamW on one fixed batch that lies in memory. "loop" is the same network fed by
 the loader from a cache: decoding is done, but warp, light and noise are drawn anew, weights are averaged and gradients
 clipped, as `gknet train` does it. Both alternate in one process, so that their ratio means something on a busy machine.
-Without DATA the pictures are noise: their content does not change the work.
+Without DATA the images are noise: their content does not change the work.
 """
 
 from __future__ import annotations

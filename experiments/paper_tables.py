@@ -302,7 +302,7 @@ def run_training(work: Path, spacecraft: str, out: Path, settings: TrainSettings
 
 
 def learning_curve(run: Path) -> dict[str, object]:
-    """Pictures of the whole run, and its validation RMSE in px along the way, from its metrics."""
+    """Images of the whole run, and its validation RMSE in px along the way, from its metrics."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     pictures = [int(float(row["samples"])) for row in rows]

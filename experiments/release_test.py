@@ -57,7 +57,7 @@ def render(work: Path) -> None:
 def labels(dataset: SkdDataset) -> dict[str, str]:
     """SHA-256 of each sequence's labels: the frames' numbers and their poses, rounded.
 
-    Pictures, and keypoints that are hidden by a hair's breadth, may differ between processors; poses may not.
+    Images, and keypoints that are hidden by a hair's breadth, may differ between processors; poses may not.
     """
     sums: dict[str, hashlib._Hash] = {}
     for i in range(len(dataset)):

@@ -9,7 +9,7 @@ Time       45 minutes of rendering, then 70 minutes of training: two runs at a t
 Expected   the table of README.md, printed by experiments/shipped_tables.py from RESULTS
 
 --start names the models of the release before, whose weights are trained on, with another --seed than theirs, or they
-see the same pictures in the same order again; with --keep-locators its locators ship as they are. Without --start all
+see the same images in the same order again; with --keep-locators its locators ship as they are. Without --start all
 three begin with a run of 17 minutes on the first one. What ships is the mean of the weights before and after a run,
 with the share that validates best, if both are of the same network. Every stage keeps what is done: run the command
 again after an interruption.
@@ -117,7 +117,7 @@ SCALES = {
 
 
 def render(work: Path, scale: Scale, kinds: tuple[str, ...] = KINDS) -> None:
-    """Crops to train the keypoints on, small whole pictures for the locators, whole frames to judge by.
+    """Crops to train the keypoints on, small whole images for the locators, whole frames to judge by.
 
     The first 300 sequences of the longer recipe are skd's own, so its train split holds none of skd's val and test.
     """
@@ -207,7 +207,7 @@ def run_and_blend(job: Job) -> str:
 
 
 def run(job: Job) -> str:
-    """One training, from where it stopped; crops or small pictures to learn from, whole frames to validate on."""
+    """One training, from where it stopped; crops or small images to learn from, whole frames to validate on."""
     work, out = job.work, job.work / "runs" / job.run
     resume = (out / CHECKPOINT).exists()
     state = train(work / job.data, job.name, out, job.settings, resume, work / "cache", work / "frames", quiet=True)

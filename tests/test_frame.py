@@ -82,7 +82,7 @@ def test_true_box_is_the_part_in_the_image() -> None:
     assert cut is not None
     assert cut.x1 == 1024
     assert frame(Pose(np.eye(3), np.array([50.0, 0, 14]))).true_box(POINTS_M) is None
-    corners = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])  # all about the picture, none in it
+    corners = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])  # all about the image, none in it
     assert frame(Pose(np.eye(3), np.array([0.0, 0, 14]))).true_box(corners) is None
 
 

@@ -181,15 +181,15 @@ class FailureKind(StrEnum):
     """
 
     UNREADABLE_IMAGE = "unreadable_image"
-    """The picture cannot be read."""
+    """The image cannot be read."""
     CAMERA_MISMATCH = "camera_mismatch"
-    """The camera is for pictures of another size."""
+    """The camera is for images of another size."""
     NO_SPACECRAFT = "no_spacecraft"
-    """The locator finds no spacecraft in the picture."""
+    """The locator finds no spacecraft in the image."""
     NO_KEYPOINT_IN_VIEW = "no_keypoint_in_view"
-    """By its labels, the picture shows no keypoint."""
+    """By its labels, the image shows no keypoint."""
     BOX_OUTSIDE_IMAGE = "box_outside_image"
-    """The box given has no part in the picture."""
+    """The box given has no part in the image."""
     NOT_FINITE = "not_finite"
     """The network's output is not finite."""
 
@@ -225,7 +225,7 @@ class Failure:
 
     Attributes:
         kind: What a program branches on; the same cause always has the same kind.
-        detail: One line for people, with the numbers of this picture. Its wording may change between versions.
+        detail: One line for people, with the numbers of this image. Its wording may change between versions.
     """
 
     kind: FailureKind
@@ -317,10 +317,10 @@ class PoseEstimator(Protocol):
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A picture that is listed but cannot be used, and why.
+    """An image that is listed but cannot be used, and why.
 
     Attributes:
-        name: The picture's name, as that of a `Frame`.
+        name: The image's name, as that of a `Frame`.
         failure: Why it cannot be used; its kind is `unreadable_image` unless there is a better one.
     """
 
@@ -329,10 +329,10 @@ class Unreadable:
 
     @staticmethod
     def because(name: str, reason: object) -> Unreadable:
-        """A picture that cannot be read.
+        """An image that cannot be read.
 
         Args:
-            name: The picture's name.
+            name: The image's name.
             reason: An error or a sentence; its text becomes the failure's detail.
         """
         return Unreadable(name, Failure(FailureKind.UNREADABLE_IMAGE, str(reason)))

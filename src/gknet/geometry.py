@@ -270,7 +270,7 @@ class Camera:
         return (pixels[:, 0] >= 0) & (pixels[:, 0] <= self.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] <= self.height)
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same lens at another resolution: of a picture that was resized to `width` x `height` pixels.
+        """The same lens at another resolution: of an image that was resized to `width` x `height` pixels.
 
         Args:
             width: Of the other image, in pixels.
@@ -284,7 +284,7 @@ class Camera:
         if abs(width * self.height / self.width - height) >= 1 and abs(height * self.width / self.height - width) >= 1:
             raise GknetError(
                 f"camera: {width} x {height} pixels are not {self.width} x {self.height} resized: the aspect ratio "
-                "differs, so the picture was cut; give the camera of the picture itself"
+                "differs, so the image was cut; give the camera of the image itself"
             )
         stretch = np.diag([width / self.width, height / self.height, 1])
         return Camera(stretch @ self.matrix, width, height, self.distortion, self.model)

@@ -105,7 +105,7 @@ def test_truth_scores_zero_and_a_failure_counts(use: Use, dataset: Path, tmp_pat
 
 def test_every_takes_fewer_frames(use: Use, dataset: Path, tmp_path: Path) -> None:
     use(ToyEstimator())
-    metrics, page = evaluated(dataset, tmp_path, "--every", "2", "--pictures", "1")
+    metrics, page = evaluated(dataset, tmp_path, "--every", "2", "--images", "1")
     assert metrics["runs"]["oracle"]["frames"] == 6
     assert page.tags.count("img") == 3
 

@@ -114,7 +114,7 @@ def test_folder_goes_on_past_bad_pictures(
     use(ToyEstimator(blind=frozenset({1}), ambiguous=frozenset({2})))
     data = (pictures / "a.jpg").read_bytes()
     (pictures / "half.jpg").write_bytes(data[: len(data) // 2])
-    (pictures / "text.png").write_text("no picture")
+    (pictures / "text.png").write_text("no image")
     out = tmp_path / "out"
     assert predict(pictures, *MODEL, *LENS, "--out", out) == 0
     status = {record["name"]: record["status"] for record in records(out)}
@@ -126,7 +126,7 @@ def test_folder_goes_on_past_bad_pictures(
         "text.png": "unreadable",
     }
     words = capsys.readouterr().out
-    assert "pose found in 2 of 5 pictures, 3 failed" in words
+    assert "pose found in 2 of 5 images, 3 failed" in words
     assert "truncated" in words
     assert "1 of the poses may be that of a symmetric counterpart" in words
     assert [record.get("attitude_confidence") for record in records(out)] == [0.9, None, 0.2, None, None]
@@ -210,7 +210,7 @@ def test_no_pose_at_all_is_two_but_is_recorded(use: Use, refused: Refused, pictu
     use(ToyEstimator(blind=frozenset({0})))
     out = tmp_path / "out"
     line = refused("predict", pictures / "a.jpg", *MODEL, *LENS, "--out", out)
-    assert "no pose in any of 1 picture; the first, a.jpg: the locator finds no spacecraft" in line
+    assert "no pose in any of 1 image; the first, a.jpg: the locator finds no spacecraft" in line
     assert records(out)[0]["failure"]["kind"] == "no_spacecraft"
 
 
@@ -290,7 +290,7 @@ def test_bad_inputs(use: Use, refused: Refused, pictures: Path, film: Path, tmp_
     whole = (pictures / "a.jpg").read_bytes()
     (tmp_path / "half.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "empty.jpg").write_bytes(b"")
-    (tmp_path / "words.jpg").write_text("no picture")
+    (tmp_path / "words.jpg").write_text("no image")
     (tmp_path / "words.mp4").write_text("no video")
     (tmp_path / "cut.mp4").write_bytes(film.read_bytes()[:300])
     (tmp_path / "nothing").mkdir()
@@ -356,7 +356,7 @@ def test_bad_datasets(name: str, text: str, words: str, use: Use, refused: Refus
 
 
 def stop_at(monkeypatch: pytest.MonkeyPatch, error: BaseException, picture: int) -> None:
-    """Raise inside the estimator at a picture."""
+    """Raise inside the estimator at an image."""
     honest = ToyEstimator.estimate
     pictures = []
 
@@ -404,7 +404,7 @@ def test_a_stop_signal_ends_after_the_picture_and_says_what_is_kept(
     monkeypatch.setattr(ToyEstimator, "estimate", estimate)
     out = tmp_path / "out"
     line = refused("predict", film, *MODEL, *LENS, "--video", "--out", out, code=code)
-    assert f"interrupted; {out} holds the results of 1 picture;" in line
+    assert f"interrupted; {out} holds the results of 1 image;" in line
     assert "--resume" in line
     assert len(records(out)) == 1
     assert open_video(out / "overlay.mp4").announced == 1

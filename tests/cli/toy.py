@@ -1,4 +1,4 @@
-"""A toy spacecraft, pictures of it that carry their own number, and an estimator that reads the number and knows."""
+"""A toy spacecraft, images of it that carry their own number, and an estimator that reads the number and knows."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _annotation(index: int, number: int) -> Annotation:
 
 @dataclass(frozen=True, eq=False)
 class ToyEstimator:
-    """Knows the truth of a toy picture by its number; `error` shifts it, numbers in `blind` have no pose, and those in
+    """Knows the truth of a toy image by its number; `error` shifts it, numbers in `blind` have no pose, and those in
     `ambiguous` one that is ambiguous."""
 
     error: float = 0.0

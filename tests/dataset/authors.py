@@ -2,7 +2,7 @@
 
 Stored axes are Unreal's (x forward, y right, z down) and quaternions xyzw. Row vectors turn by v' = v P, rotations by
 R' = P^T R P, intrinsics by K' = K P; the primed ones are OpenCV's, and both functions below speak of those. Row i of
-annotations.csv is the picture i + 1.
+annotations.csv is the image i + 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ P = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
 @dataclass(frozen=True, eq=False)
 class Record:
     """One frame. rotation (3, 3) and translation (3,) take body to camera; keypoints (n, 2) and box x0, y0, x1, y1
-    are in pixels, the box that of the keypoints, clipped to the picture; None when nothing of it is inside."""
+    are in pixels, the box that of the keypoints, clipped to the image; None when nothing of it is inside."""
 
     split: str
     category: str
@@ -49,7 +49,7 @@ def turned(x: float, y: float, z: float, w: float) -> ndarray:
 
 
 def read(root: Path, size: int) -> list[Record]:
-    """Every frame of the three splits; pictures are `size` pixels wide and high, their camera is that of the root."""
+    """Every frame of the three splits; images are `size` pixels wide and high, their camera is that of the root."""
     matrix = np.loadtxt(root / "camera_matrix.txt", delimiter=",") @ P
     records = []
     for split in ("train", "val", "test"):
@@ -83,7 +83,7 @@ def _record(
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A picture (h, w, 3) RGB and the pose behind it, OpenCV axes."""
+    """An image (h, w, 3) RGB and the pose behind it, OpenCV axes."""
 
     image: ndarray
     rotation: ndarray

@@ -35,7 +35,7 @@ CRAFTS = ("satellite_01", "satellite_02")
 
 
 def pose(random: np.random.Generator) -> Pose:
-    """Often cut off by the picture's border, never with every keypoint outside; one in three is a half turn."""
+    """Often cut off by the image's border, never with every keypoint outside; one in three is a half turn."""
     place = np.array([*random.uniform(-3, 3, 2), random.uniform(8, 14)])
     xyzw = random.normal(size=4)
     if random.random() < 1 / 3:

@@ -66,7 +66,7 @@ def prose(page: Path) -> str:
 
 
 def links(page: Path) -> Iterator[str]:
-    """Targets of Markdown links and pictures, and of what HTML in the page points to."""
+    """Targets of Markdown links and images, and of what HTML in the page points to."""
     text = re.sub(r"`[^`\n]*`", "", prose(page))
     yield from re.findall(r"\]\(<?([^)\s>]+)>?(?: \"[^\"]*\")?\)", text)
     yield from re.findall(r"(?:src|href)=\"([^\"]+)\"", text)

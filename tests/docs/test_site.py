@@ -58,7 +58,7 @@ def test_the_whole_public_api_is_in_the_reference() -> None:
 
 
 def test_drawings_are_current(tmp_path: Path) -> None:
-    """docs/figures.py draws the pictures in docs/images, up to the last digits of its numbers."""
+    """docs/figures.py draws the images in docs/images, up to the last digits of its numbers."""
     pytest.importorskip("matplotlib")
     drawn = runpy.run_path(str(DOCS / "figures.py"))["draw"](tmp_path)
     assert {path.name for path in drawn} == {path.name for path in (DOCS / "images").glob("*.svg")}

@@ -74,7 +74,7 @@ def test_eval_says_what_it_knows_and_what_it_does_not(
 
 
 def test_predict_takes_the_folder_and_its_camera(folder: Path, model: Path, tmp_path: Path) -> None:
-    """The network has learned nothing, so the command may find no pose at all; it answers for every picture."""
+    """The network has learned nothing, so the command may find no pose at all; it answers for every image."""
     run(["predict", str(folder), "--model", str(model), "--split", "test", "--oracle", "--out", str(tmp_path)])
     records = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text(encoding="utf-8").splitlines()]
     assert [record["name"] for record in records] == [f"000003/00000{k}" for k in (1, 2, 3)]

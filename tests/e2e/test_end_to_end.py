@@ -101,7 +101,7 @@ def constant_rmse_px(products: Products) -> float:
 def metrics(products: Products) -> dict[str, dict[str, dict[str, float]]]:
     """Metric -> statistics, for each protocol."""
     out = products.model.parent / "evaluation"
-    gknet("eval", products.test, "--model", products.model, "--split", "test", "--out", out, "--pictures", 2)
+    gknet("eval", products.test, "--model", products.model, "--split", "test", "--out", out, "--images", 2)
     assert (out / "report.html").stat().st_size > 10_000
     content = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     return {protocol: run["metrics"] for protocol, run in content["runs"].items()}
@@ -142,7 +142,7 @@ def test_locator_beats_the_whole_picture(products: Products, metrics: dict[str, 
     boxes = [test.frame(i, image=False).true_box(test.spacecraft.points_m) for i in range(len(test))]
     baseline = float(np.mean([box.area / 256**2 for box in boxes if box is not None]))
     found = metrics["detected"]["locator_iou"]["mean"]
-    print(f"IoU: {found:.2f}, whole picture {baseline:.2f}")
+    print(f"IoU: {found:.2f}, whole image {baseline:.2f}")
     assert found > max(0.6, 2 * baseline)
 
 

@@ -44,7 +44,7 @@ def test_floor_and_scale_are_found(floor: float, scale: float, swapped: float) -
 
 
 def samples(common_px: float, own_px: float, rng: np.random.Generator, count: int = 150) -> list[CalibrationSample]:
-    """Keypoints off by an error of their own, and by a growth about the centre that all of a picture share."""
+    """Keypoints off by an error of their own, and by a growth about the centre that all of an image share."""
     made = []
     for k in range(count):
         pose = Pose(Rotation.random(random_state=k).as_matrix(), np.array([0.2, -0.3, 14.0]))

@@ -76,7 +76,7 @@ def test_probability_near_an_attitude() -> None:
 
 @pytest.mark.parametrize("chosen", [0, 300, 777, 1500, 2047])
 def test_an_attitude_puts_keypoints_where_a_camera_far_away_sees_them(chosen: int) -> None:
-    """Anywhere in the picture, in the crop about them."""
+    """Anywhere in the image, in the crop about them."""
     camera = Camera.from_focal(40_000, 8000, 8000)
     place_m = np.array([30.0, -20.0, 400.0])
     attitude = Rotation.from_quat(BINS.centres_wxyz[chosen, [1, 2, 3, 0]]).as_matrix()

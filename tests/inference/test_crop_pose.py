@@ -1,4 +1,4 @@
-"""A pose as a crop shows it: encoding and decoding are inverse, rotations of the picture are rolls of the camera."""
+"""A pose as a crop shows it: encoding and decoding are inverse, rotations of the image are rolls of the camera."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def crops(draw: st.DrawFn) -> Crop:
 
 @st.composite
 def poses_in_view(draw: st.DrawFn, camera: Camera) -> Pose:
-    """Any rotation, the origin in front of the camera and at or near the picture."""
+    """Any rotation, the origin in front of the camera and at or near the image."""
     pixel = np.array([draw(st.floats(-100, 1100)), draw(st.floats(-100, 1100))])
     ray = np.linalg.solve(camera.matrix, np.append(pixel, 1.0))
     slope = float(np.linalg.norm(ray[:2]))

@@ -32,7 +32,7 @@ CAMERA = Camera.from_focal(1000, 800, 640)
 
 
 class Chart:
-    """A picture whose red and green encode where each pixel is, and whose blue marks the picture itself.
+    """An image whose red and green encode where each pixel is, and whose blue marks the image itself.
 
     Red and green rise from 0 to 1 over the square from `low` to `low + span`, dithered so that they err nowhere.
     """
@@ -92,7 +92,7 @@ def perfect_locator(box: Box, chart: Chart) -> Callable[[np.ndarray], np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A picture with its truth, and an estimator whose network makes no error."""
+    """An image with its truth, and an estimator whose network makes no error."""
 
     estimator: KeypointEstimator
     network: PerfectNetwork
@@ -142,7 +142,7 @@ def test_image_to_pose(name: str, oracle: bool) -> None:
 
 
 def test_what_one_orientation_alone_shows_is_averaged_out() -> None:
-    """A dot in the picture, and a higher peak at one cell of every view, which is another place in each of them."""
+    """A dot in the image, and a higher peak at one cell of every view, which is another place in each of them."""
     y, x = np.mgrid[:256, :256] + 0.5
     dot = np.exp(-((x - 170) ** 2 + (y - 80) ** 2) / (2 * 6**2))
     image = np.repeat((230 * dot).astype(np.uint8)[:, :, None], 3, axis=2)

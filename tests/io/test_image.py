@@ -60,7 +60,7 @@ def test_truncation_is_found(tmp_path: Path, rgb: np.ndarray, name: str, kept: f
 
 def test_missing_empty_and_foreign_files(tmp_path: Path, rgb: np.ndarray) -> None:
     (tmp_path / "empty.jpg").touch()
-    (tmp_path / "text.jpg").write_text("no picture")
+    (tmp_path / "text.jpg").write_text("no image")
     for name in ("missing.jpg", "empty.jpg", "text.jpg", "."):
         with pytest.raises(GknetError, match=str(tmp_path)):
             read_image(tmp_path / name)

@@ -244,7 +244,7 @@ def test_a_video_of_which_no_frame_decodes(tmp_path: Path) -> None:
 
 
 class FakeCapture:
-    """A camera that delivers `frames` pictures and then nothing; each third grab fails."""
+    """A camera that delivers `frames` images and then nothing; each third grab fails."""
 
     def __init__(self, frames: int) -> None:
         self.left, self.grabs = frames, 0

@@ -26,7 +26,7 @@ TOY = toy_spacecraft()
 
 
 def numbers(source: Iterable[Frame | Unreadable]) -> list[int]:
-    """The numbers of the toy pictures that were read."""
+    """The numbers of the toy images that were read."""
     frames = [picture for picture in source if isinstance(picture, Frame)]
     return [picture_number(frame.image) for frame in frames if frame.image is not None]
 
@@ -41,7 +41,7 @@ def film(path: Path, *pictures: int) -> Path:
 def test_folder_is_sorted_and_thinned(tmp_path: Path) -> None:
     for number in (3, 1, 2, 0):
         write_image(tmp_path / f"{number}.png", toy_picture(number))
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     assert numbers(open_source(tmp_path, LENS, TOY)) == [0, 1, 2, 3]
     assert numbers(open_source(tmp_path, LENS, TOY, every=3)) == [0, 3]
     assert open_source(tmp_path, LENS, TOY, every=3).count == 2

@@ -39,7 +39,7 @@ SENSOR = Sensor(
 CAMERA = Camera.from_focal(280, 200, 200)
 FULL = Crop(0, 0, 200, 200)
 FACING = Pose(np.diag([1.0, -1, -1]), np.array([0, 0, 6.0]))
-"""The camera looks at the +z side of the body from 6 m, +y of the body up in the picture."""
+"""The camera looks at the +z side of the body from 6 m, +y of the body up in the image."""
 
 
 def shot(

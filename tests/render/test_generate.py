@@ -1,4 +1,4 @@
-"""The rendering stage: what is planned and written, what a resumed job does. Stand-ins make the pictures."""
+"""The rendering stage: what is planned and written, what a resumed job does. Stand-ins make the images."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def everything(root: Path) -> dict[str, bytes]:
 
 
 def test_keypoints_fall_on_their_discs(tmp_path: Path) -> None:
-    """Pose, camera and picture agree, for the whole sensor and for windows that leave it."""
+    """Pose, camera and image agree, for the whole sensor and for windows that leave it."""
     for window in ("frame", "target"):
         root = tmp_path / window
         run(root, window=window, size=128, mask=True, frames=6, sequences=1)

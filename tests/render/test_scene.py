@@ -87,7 +87,7 @@ def test_the_picture_covers_what_the_mask_covers(box_renderer: Renderer) -> None
     assert rendered.alpha.sum() == pytest.approx(rendered.mask.sum(), rel=0.02)
     assert (rendered.radiance[rendered.alpha == 0] == 0).all()
     assert ((rendered.depth_m > 0) == rendered.mask).all()
-    # The centroids agree to a tenth of a pixel: picture and labels share one convention of pixels.
+    # The centroids agree to a tenth of a pixel: image and labels share one convention of pixels.
     grid = np.stack(np.meshgrid(np.arange(200), np.arange(200)), axis=-1)
     by_picture = np.average(grid.reshape(-1, 2), axis=0, weights=rendered.alpha.ravel())
     by_mask = grid[rendered.mask].mean(axis=0)

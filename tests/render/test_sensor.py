@@ -1,4 +1,4 @@
-"""The sensor: linear below saturation, noise that averages, light that is kept, one picture per seed."""
+"""The sensor: linear below saturation, noise that averages, light that is kept, one image per seed."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def test_a_killed_render_leaves_no_worker_and_goes_on(out: Path) -> None:
 
 @pytest.mark.slow
 def test_two_renders_into_one_folder_share_it(out: Path) -> None:
-    """The same sequence at once with other frames: every frame has its picture and its label."""
+    """The same sequence at once with other frames: every frame has its image and its label."""
     calls = [[*command(out, 1), "--frames", "12", "--every", every, "--first", "1"] for every in ("1", "3")]
     processes = [
         subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment())

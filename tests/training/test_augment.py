@@ -1,4 +1,4 @@
-"""One matrix moves picture, points and camera alike."""
+"""One matrix moves image, points and camera alike."""
 
 from __future__ import annotations
 

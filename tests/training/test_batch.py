@@ -47,7 +47,7 @@ def test_a_sample_moves_every_point_as_one_and_never_renumbers(tmp_path: Path) -
 
 def loader(folder: Path, draw: Draw = draw_keypoints, **options: int) -> Loader:
     data = SkdDataset(folder, "train", "satellite_01")
-    window: Window = "picture" if draw is draw_box else "craft"
+    window: Window = "image" if draw is draw_box else "craft"
     return Loader(build_cache(data, data.spacecraft, folder / f"cache_{window}", 96, window), draw, 7, **options)
 
 

@@ -112,7 +112,7 @@ def caches(folder: Path) -> list[Path]:
 
 
 def bright(image: Path) -> None:
-    """Another picture of the same size, and of the same number of bytes."""
+    """Another image of the same size, and of the same number of bytes."""
     before = image.stat().st_size
     import cv2
 
@@ -166,7 +166,7 @@ def test_a_damaged_cache_is_built_anew(name: str, damage: str, folder: Path) -> 
         path.write_bytes(new)
     after = opened(folder)
     np.testing.assert_array_equal(after.points_px, points)
-    if not (name == IMAGES and damage == "flipped"):  # another pixel is still a picture
+    if not (name == IMAGES and damage == "flipped"):  # another pixel is still an image
         np.testing.assert_array_equal(after.images, images)
 
 

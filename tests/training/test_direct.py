@@ -70,7 +70,7 @@ def model(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def a_frame(k: int, distortion: float = 0.0) -> Frame:
-    """Aside in the picture, so that the line of sight is not the axis."""
+    """Aside in the image, so that the line of sight is not the axis."""
     lens = np.array([distortion, 0, 0, 0, 0])
     camera = Camera(np.array([[600.0, 0, 230], [0, 600, 290], [0, 0, 1]]), 512, 512, lens)
     rng = np.random.default_rng(k)
@@ -108,7 +108,7 @@ def test_the_pose_of_a_sample_puts_the_keypoints_where_they_are(seed: int) -> No
 
 
 def test_a_symmetric_lens_rolls_with_the_camera() -> None:
-    """The label of a turned picture is the label of the picture that a rolled camera would take."""
+    """The label of a turned image is the label of the image that a rolled camera would take."""
     frame = replace(a_frame(3, distortion=-0.2))
     matrix = frame.camera.matrix.copy()
     matrix[:2, 2] = 256
@@ -132,7 +132,7 @@ def test_a_symmetric_lens_rolls_with_the_camera() -> None:
 
 def test_the_whole_picture_of_the_locator_has_its_pose_too(data: Path) -> None:
     dataset = SkdDataset(data, "train", "satellite_01")
-    cache = build_cache(dataset, dataset.spacecraft, data / "cache_picture", 96, "picture")
+    cache = build_cache(dataset, dataset.spacecraft, data / "cache_image", 96, "image")
     sample = Loader(cache, draw_box, 0).sample(0, 64)
     assert np.isfinite(sample.pose).all()
 
@@ -213,7 +213,7 @@ def test_pixels_that_are_not_square_are_refused_to_a_direct_network_alone() -> N
 
 
 def test_pixels_that_are_not_square_leave_the_attitude_unknown() -> None:
-    """A turned picture of them is of no pose, so nothing is to be learnt of it; the keypoints turn all the same."""
+    """A turned image of them is of no pose, so nothing is to be learnt of it; the keypoints turn all the same."""
     frame = a_frame(0)
     wide = Camera(frame.camera.matrix * np.array([[1.1], [1], [1]]), 512, 512)
     square, stretched = (cached_row(replace(frame, camera=each), CRAFT, "craft", 96) for each in (frame.camera, wide))
@@ -271,7 +271,7 @@ def test_the_commands_work_with_it(data: Path, model: Path, tmp_path: Path) -> N
     assert {"e_t", "e_q_rad"} <= set(oracle["metrics"])
     for layout in ("jsonl", "csv"):
         code = command(["predict", str(data), *arguments, "--oracle", "--format", layout])
-        assert code in (0, 2)  # 2 where neither frame has a pose: it was trained on 12 pictures
+        assert code in (0, 2)  # 2 where neither frame has a pose: it was trained on 12 images
     line = json.loads((tmp_path / "poses.jsonl").read_text().splitlines()[0])
     assert line["status"] in ("ok", "no pose")
     assert line["covariance"] is None

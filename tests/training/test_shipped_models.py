@@ -1,4 +1,4 @@
-"""The recipe of the shipped models on drawn pictures: it trains, blends, exports, and chooses what it says it does."""
+"""The recipe of the shipped models on drawn images: it trains, blends, exports, and chooses what it says it does."""
 
 from __future__ import annotations
 

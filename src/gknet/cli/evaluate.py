@@ -29,7 +29,7 @@ def evaluate(
     split: Annotated[str, typer.Option(help="train, val, test, or all.")] = "test",
     every: Annotated[int, typer.Option(min=1, help="Take each n-th frame of a sequence.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for metrics.json and report.html.")] = Path("evaluation"),
-    pictures: Annotated[int, typer.Option(min=0, max=1000, help="Pictures in each gallery of the report.")] = 6,
+    images: Annotated[int, typer.Option(min=0, max=1000, help="Images in each gallery of the report.")] = 6,
     threads: ThreadsOption = None,
     device: DeviceOption = "cpu",
     tta_rotations: RotationsOption = 1,
@@ -48,7 +48,7 @@ def evaluate(
     with output_folder(out):
         with progress() as bar:
             task = bar.add_task("frames", total=len(dataset))
-            section = evaluate_section(dataset, estimator, words, pictures, lambda: bar.advance(task))
+            section = evaluate_section(dataset, estimator, words, images, lambda: bar.advance(task))
         title = f"Pose of {estimator.spacecraft.name} on {name}"
         written = write_report(out, title, [section], section.evaluation.to_dict())
     print_table(metric_table(section.evaluation))

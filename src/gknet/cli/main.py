@@ -36,7 +36,7 @@ _EXTRA_OF_MODULE = {
 
 app = typer.Typer(
     name="gknet",
-    help="Pose of known spacecraft from a picture: render, train, export, predict, evaluate.",
+    help="Pose of known spacecraft from an image: render, train, export, predict, evaluate.",
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -58,12 +58,12 @@ def predict(
         str | None, typer.Option(metavar="WxH", help="Image size of --camera, where its file does not state it.")
     ] = None,
     scale_camera: Annotated[
-        bool, typer.Option("--scale-camera", help="The pictures were resized: scale --camera to their size.")
+        bool, typer.Option("--scale-camera", help="The images were resized: scale --camera to their size.")
     ] = False,
     box: Annotated[str | None, typer.Option(help="Where the spacecraft is, as x0,y0,x1,y1 in pixels.")] = None,
     oracle: Annotated[bool, typer.Option("--oracle", help="Take the box from a dataset's labels.")] = False,
     split: Annotated[str | None, typer.Option(help="Of a dataset: train, val or test.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Take each n-th picture.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Take each n-th image.")] = 1,
     bit_depth: Annotated[
         int | None, typer.Option(min=9, max=16, help="Of images of more than 8 bits that do not state it.")
     ] = None,
@@ -74,13 +74,13 @@ def predict(
         bool, typer.Option("--overwrite", help="Replace results of another run that are in --out.")
     ] = False,
     layout: Annotated[PoseLayout, typer.Option("--format", help="Layout of the poses file.")] = PoseLayout.jsonl,
-    overlay: Annotated[bool, typer.Option("--overlay/--no-overlay", help="Write overlay pictures.")] = True,
+    overlay: Annotated[bool, typer.Option("--overlay/--no-overlay", help="Write overlay images.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Write an overlay video.")] = False,
     threads: ThreadsOption = None,
     device: DeviceOption = "cpu",
     tta_rotations: RotationsOption = 1,
 ) -> None:
-    """Estimate the pose of a spacecraft in pictures.
+    """Estimate the pose of a spacecraft in images.
 
     The poses found so far are kept whatever ends the run; --resume goes on with them.
     """
@@ -185,7 +185,7 @@ def _camera_words(
 
 
 def warn_of_sizes(lens: Lens, sizes: Sequence[tuple[int, int]]) -> None:
-    """A warning where one focal length in pixels served pictures of several sizes."""
+    """A warning where one focal length in pixels served images of several sizes."""
     from gknet.io.lens import has_fixed_focal_length
 
     if len(sizes) < 2 or not has_fixed_focal_length(lens):
@@ -193,13 +193,13 @@ def warn_of_sizes(lens: Lens, sizes: Sequence[tuple[int, int]]) -> None:
     shown = ", ".join(f"{width}x{height}" for width, height in sizes[:_SHOWN_SIZES])
     more = f" and {len(sizes) - _SHOWN_SIZES} more" if len(sizes) > _SHOWN_SIZES else ""
     print_warning(
-        f"one focal length in pixels was used for pictures of several sizes, {shown}{more}: it fits one size alone "
+        f"one focal length in pixels was used for images of several sizes, {shown}{more}: it fits one size alone "
         "unless the others were cut from it; give --hfov-deg, or run each size with its own camera"
     )
 
 
 def print_summary(writer: PredictionWriter) -> None:
-    """The summary on standard output; GknetError when no picture gave a pose."""
+    """The summary on standard output; GknetError when no image gave a pose."""
     from gknet.frame import AMBIGUOUS_BELOW
     from gknet.io.text import counted
 
@@ -208,9 +208,9 @@ def print_summary(writer: PredictionWriter) -> None:
         print_warning(sentence)
     if writer.pose_count == 0:
         first = f"; the first, {failures[0].name}: {failures[0].failure}" if failures else ""
-        raise GknetError(f"no pose in any of {counted(writer.count, 'picture')}{first}")
+        raise GknetError(f"no pose in any of {counted(writer.count, 'image')}{first}")
     kept = f", {writer.kept_count} of them from an earlier run" if writer.kept_count else ""
-    print_line(f"pose found in {writer.pose_count} of {counted(writer.count, 'picture')}, {len(failures)} failed{kept}")
+    print_line(f"pose found in {writer.pose_count} of {counted(writer.count, 'image')}, {len(failures)} failed{kept}")
     if writer.ambiguous_count:
         print_line(
             f"  {writer.ambiguous_count} of the poses may be that of a symmetric counterpart: "

@@ -31,7 +31,7 @@ class Extras:
         index: The frame's place in its sequence, from 0.
         category: The spacecraft as the split file spells it.
         sequence: The sequence's folder as the split file spells it, such as data/000001.
-        image_path: The picture.
+        image_path: The image.
         mask_path: The mask of the spacecraft.
         depth_path: The depth map, in m.
         recipe: The recipe's name, of a rendered frame.
@@ -117,10 +117,10 @@ class SkdDataset(Sequence[Frame]):
 
         Args:
             i: From 0.
-            image: Whether the picture is read too.
+            image: Whether the image is read too.
 
         Raises:
-            GknetError: Its label or its picture is damaged.
+            GknetError: Its label or its image is damaged.
         """
         sequence, annotation = self._annotation(i)
         pixels = read_image(sequence.image_path(annotation.index)) if image else None

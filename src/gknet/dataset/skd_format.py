@@ -40,8 +40,8 @@ class Annotation:
         time_s: Since the sequence's first frame, in s.
         visible: (n,) bool: keypoint in view and not hidden.
         sun_direction: (3,) unit vector to the sun in the camera frame.
-        earth: Whether the Earth is in the picture.
-        camera: Of this picture, which may be a part of the full image.
+        earth: Whether the Earth is in the image.
+        camera: Of this image, which may be a part of the full image.
         recipe: Name of the recipe that the renderer made the frame from.
         seed: The renderer's.
     """

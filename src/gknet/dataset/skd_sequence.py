@@ -56,7 +56,7 @@ class Skeleton:
 
 
 def read_sequence(root: Path, name: str, category: str) -> SkdSequence:
-    """Read the labels of a sequence, not its pictures.
+    """Read the labels of a sequence, not its images.
 
     Args:
         root: The dataset's folder.
@@ -104,7 +104,7 @@ def read_rows(path: Path) -> tuple[dict[str, str], ...]:
 
 
 def _indices(folder: Path, rows: tuple[dict[str, str], ...]) -> tuple[int, ...]:
-    """The frame of each row: its `frame` cell, else, as with the authors, row i is frame i. Pictures may be lost."""
+    """The frame of each row: its `frame` cell, else, as with the authors, row i is frame i. Images may be lost."""
     path = folder / "annotations.csv"
     if rows and "frame" in rows[0]:
         for number, row in enumerate(rows, start=1):

@@ -1,7 +1,7 @@
 """Covariances of keypoints and poses, fitted to the errors on a validation split.
 
 Two steps. A keypoint's covariance is a floor and a factor times the spread that follows from its peak; both are fitted
-to the keypoints' errors. Then the pose's covariance gets one factor, since keypoints of one picture err alike.
+to the keypoints' errors. Then the pose's covariance gets one factor, since keypoints of one image err alike.
 """
 
 from __future__ import annotations

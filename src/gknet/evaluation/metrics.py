@@ -53,7 +53,7 @@ class FrameErrors:
         range_diameters: True distance in diameters.
         phase_angle_rad: `Frame.phase_angle_rad`.
         visible_fraction: Keypoints in view and not hidden, over all.
-        earth_in_view: 1 with a part of the Earth in the picture, 0 without.
+        earth_in_view: 1 with a part of the Earth in the image, 0 without.
         attitude_confidence: Of the estimate; None without a pose, or of a network that has none.
     """
 
@@ -154,7 +154,7 @@ def compute_errors(
 def keypoint_errors_px(keypoints: Keypoints | None, true_px: Float[ndarray, "n 2"], crop: Crop) -> Float[ndarray, " n"]:
     """Distances from the true keypoints, (n,) in pixels of the oracle crop.
 
-    Where nothing was detected, as in a picture without a box, every keypoint is off by the crop's diagonal. One whose
+    Where nothing was detected, as in an image without a box, every keypoint is off by the crop's diagonal. One whose
     heatmap has no peak (score 0) counts at the centre of the input, where `decode_heatmaps` puts it.
 
     Args:

@@ -46,7 +46,7 @@ def _textured(
     tile_m: tuple[float, float],
     height: Float[ndarray, "h w"] | None = None,
 ) -> Material:
-    """From an sRGB picture 0 to 1, and a relief in units of its own pixels."""
+    """From an sRGB image 0 to 1, and a relief in units of its own pixels."""
     pbr = PBRMaterial(
         name=name,
         baseColorFactor=np.ones(4),

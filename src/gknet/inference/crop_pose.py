@@ -2,13 +2,13 @@
 
 The camera has the focal length f px, the crop a side of `side` px, and the body's origin the depth z (metres):
 
-    offset     (its pixel - the crop's centre) / side: where it is in the picture's plane
+    offset     (its pixel - the crop's centre) / side: where it is in the image's plane
     log_depth  log(z side / (f diameter)): 0 where the spacecraft's diameter, face on, fills the crop
     attitude   R_ray^T R: the rotation relative to the line of sight to the origin (allocentric), where R_ray is the
                smallest rotation of the optical axis onto that line
 
-None of the three changes when the same view is found elsewhere in the picture, nearer or farther. A rotation of the
-picture by an angle a is a roll of the camera about its optical axis, R_z(a): it takes the attitude A to R_z(a) A,
+None of the three changes when the same view is found elsewhere in the image, nearer or farther. A rotation of the
+image by an angle a is a roll of the camera about its optical axis, R_z(a): it takes the attitude A to R_z(a) A,
 exactly, if pixels are square and the lens is symmetric about its axis.
 """
 
@@ -27,7 +27,7 @@ from gknet.inference.attitude import AttitudeBins, rotation_of, wxyz_of
 from gknet.inference.crop import Crop
 
 SQUARE_TOLERANCE = 0.01
-"""How far fx / fy may be from 1 where pictures are rotated."""
+"""How far fx / fy may be from 1 where images are rotated."""
 
 NEAR_RAD = math.radians(60)
 """Attitudes nearer than this count as alike; symmetric counterparts are half or a quarter of a turn apart."""
@@ -118,7 +118,7 @@ def focal_px(camera: Camera) -> float:
 
 
 def has_square_pixels(camera: Camera) -> bool:
-    """Whether a rotated picture is one of a rolled camera."""
+    """Whether a rotated image is one of a rolled camera."""
     return bool(abs(camera.matrix[0, 0] / camera.matrix[1, 1] - 1) <= SQUARE_TOLERANCE)
 
 

@@ -31,7 +31,7 @@ class PnpSettings:
         box_sigma: Standard deviation of a side of the spacecraft's box, in parts of the box's longer side.
         max_box_ratio: Of the pose's extent to the box's along the box's longer side, either way, for a pose that less
             than half of the spacecraft's keypoints agree with.
-        covariance_scale: Factor on the pose's covariance: keypoints of one picture err alike, more than independent
+        covariance_scale: Factor on the pose's covariance: keypoints of one image err alike, more than independent
             ones. From the calibration on a validation split.
 
     Raises:
@@ -163,7 +163,7 @@ def _against_box(problem: PnpProblem, edges: BoxEdges, result: PnpResult, max_ra
 
 
 def _usable(keypoints: Keypoints, min_score: float) -> Bool[ndarray, " n"]:
-    """Keypoints with a sufficient score whose position and covariance are numbers that a picture can have."""
+    """Keypoints with a sufficient score whose position and covariance are numbers that an image can have."""
     covariance = keypoints.covariance_px2
     known = (np.abs(keypoints.pixels) <= LARGEST_PX).all(axis=1) & (np.abs(covariance) <= LARGEST_PX**2).all(
         axis=(1, 2)

@@ -107,7 +107,7 @@ def _ros_model(source: object, name: object, count: int) -> LensModel:
 def _from_kalibr(source: object, content: dict[Any, Any]) -> Camera | MatrixOnly:
     names = [str(key) for key in content if re.fullmatch(r"cam\d+", str(key))]
     if len(names) > 1:
-        raise GknetError(f"{source}: a camchain of {', '.join(names[:9])}; keep the one that took the pictures")
+        raise GknetError(f"{source}: a camchain of {', '.join(names[:9])}; keep the one that took the images")
     camera = content[names[0]]
     if not isinstance(camera, dict):
         raise GknetError(f"{source}: {names[0]}: expected names and values, got {quoted(camera)}")

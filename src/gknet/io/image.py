@@ -40,7 +40,7 @@ class ImageFile:
 
     Attributes:
         image: (h, w, 3) RGB, pixels as the sensor stored them.
-        has_more_pages: whether the file holds more pictures than this one.
+        has_more_pages: whether the file holds more images than this one.
     """
 
     image: UInt8[ndarray, "h w 3"]
@@ -48,12 +48,12 @@ class ImageFile:
 
 
 def read_image(path: str | Path, bit_depth: int | None = None) -> UInt8[ndarray, "h w 3"]:
-    """The picture as (h, w, 3) RGB, see `read_image_file`."""
+    """The image as (h, w, 3) RGB, see `read_image_file`."""
     return read_image_file(path, bit_depth).image
 
 
 def read_image_file(path: str | Path, bit_depth: int | None = None) -> ImageFile:
-    """The picture of a file.
+    """The image of a file.
 
     Args:
         path: of an image file.
@@ -136,7 +136,7 @@ def _eight_bits(path: Path, pixels: ndarray, header: ImageHeader, bit_depth: int
 
 
 def _white(dtype: np.dtype, header: ImageHeader, bit_depth: int | None, high: float) -> float | None:
-    """The value of white in a picture of more than 8 bits, or None when nothing states it."""
+    """The value of white in an image of more than 8 bits, or None when nothing states it."""
     if bit_depth is not None:
         return float(2**bit_depth - 1)
     if header.white is not None:
@@ -159,7 +159,7 @@ def _encoded(path: Path, pixels: ndarray, parameters: list[int]) -> bytes:
 
 
 def write_image(path: str | Path, rgb: UInt8[ndarray, "h w 3"], quality: int = 95) -> None:
-    """Write a picture.
+    """Write an image.
 
     Args:
         path: the suffix (.jpg, .png ...) decides the format.
@@ -167,7 +167,7 @@ def write_image(path: str | Path, rgb: UInt8[ndarray, "h w 3"], quality: int = 9
         quality: JPEG's, 1 to 100.
 
     Raises:
-        GknetError: the array is no picture, or the format cannot hold it.
+        GknetError: the array is no image, or the format cannot hold it.
     """
     path = Path(path)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:

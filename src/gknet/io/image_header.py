@@ -1,6 +1,6 @@
 """What an image file states before it is decoded: format, size, bit depth and number of pages.
 
-A picture is refused by its size before memory is taken for it, and its bit depth is not lost in the decoder.
+An image is refused by its size before memory is taken for it, and its bit depth is not lost in the decoder.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ImageHeader:
         height: in pixels.
         white: the stored value of white, where the file states one that its decoder does not apply; else None.
         used_bits: how many bits of 16 are used, where the file states it but not whether they are the upper ones.
-        has_pages: whether the file holds more pictures than one.
+        has_pages: whether the file holds more images than one.
     """
 
     width: int

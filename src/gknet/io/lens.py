@@ -1,4 +1,4 @@
-"""Where the camera of a picture comes from: a calibration of its size, of another size, or the field of view alone."""
+"""Where the camera of an image comes from: a calibration of its size, of another size, or the field of view alone."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ class MatrixOnly:
         self.of_size(1, 1)
 
     def of_size(self, width: int, height: int) -> Camera:
-        """The camera, when the calibration is known to be for pictures of `width` x `height` pixels."""
+        """The camera, when the calibration is known to be for images of `width` x `height` pixels."""
         try:
             return Camera(self.matrix, width, height, self.distortion, self.model)
         except GknetError as error:
             raise GknetError(f"{self.source}: {error}") from error
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera of a picture.
+        """The camera of an image.
 
         Raises:
-            GknetError: the principal point is so far from the picture's middle that the calibration is of another size.
+            GknetError: the principal point is so far from the image's middle that the calibration is of another size.
         """
         x, y = self.matrix[:2, 2]
         if abs(x / width - 0.5) <= FARTHEST_CENTRE and abs(y / height - 0.5) <= FARTHEST_CENTRE:
             return self.of_size(width, height)
         fits = f"{2 * x:.0f}x{2 * y:.0f}"
         raise GknetError(
-            f"{self.source}: its principal point ({x:g}, {y:g}) is that of a picture of about {fits} pixels, the image "
+            f"{self.source}: its principal point ({x:g}, {y:g}) is that of an image of about {fits} pixels, the image "
             f"has {width}x{height}; give the calibration's size, --camera-size {fits}, with --scale-camera if the "
-            f"picture was resized, or --camera-size {width}x{height} if the matrix is right as it is"
+            f"image was resized, or --camera-size {width}x{height} if the matrix is right as it is"
         )
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """A camera with square pixels and no distortion whose axis meets the picture in its middle.
+    """A camera with square pixels and no distortion whose axis meets the image in its middle.
 
     Attributes:
         focal_px: the focal length in pixels; either this is given, or
@@ -84,14 +84,14 @@ class FieldOfView:
             raise GknetError(f"field of view: expected between 0 and 180 degrees, got {degrees:g}")
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera of a picture of `width` x `height` pixels."""
+        """The camera of an image of `width` x `height` pixels."""
         focal = self.focal_px or width / 2 / math.tan((self.horizontal_rad or 0.0) / 2)
         return Camera.from_focal(focal, width, height)
 
 
 @dataclass(frozen=True)
 class ScaledCamera:
-    """A calibration whose pictures were resized after they were taken.
+    """A calibration whose images were resized after they were taken.
 
     Attributes:
         calibrated: the camera at the size it was calibrated at.
@@ -100,22 +100,22 @@ class ScaledCamera:
     calibrated: Camera
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera of a picture of `width` x `height` pixels, see `Camera.scaled`."""
+        """The camera of an image of `width` x `height` pixels, see `Camera.scaled`."""
         return self.calibrated.scaled(width, height)
 
 
 Lens = Camera | MatrixOnly | FieldOfView | ScaledCamera
-"""What gives a picture its camera. All but a `Camera` learn the image size from the picture."""
+"""What gives an image its camera. All but a `Camera` learn the image size from the image."""
 
 
 def camera_for(lens: Lens, width: int, height: int, scale: bool = False) -> Camera:
-    """The camera of a picture.
+    """The camera of an image.
 
     Args:
         lens: where the camera comes from.
-        width: of the picture, in pixels.
-        height: of the picture, in pixels.
-        scale: scale a camera that was calibrated at another size, for pictures that were resized.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
+        scale: scale a camera that was calibrated at another size, for images that were resized.
 
     Raises:
         GknetError: the camera was made for another size, and `scale` is not set or the aspect ratio differs.
@@ -128,12 +128,12 @@ def camera_for(lens: Lens, width: int, height: int, scale: bool = False) -> Came
         return lens.scaled(width, height)
     raise GknetError(
         f"camera: it is for {lens.width} x {lens.height} pixels, the image has {width} x {height}; "
-        "give --scale-camera if the picture was resized"
+        "give --scale-camera if the image was resized"
     )
 
 
 def has_fixed_focal_length(lens: Lens) -> bool:
-    """Whether pictures of any size get the same focal length in pixels, which is right for one size alone."""
+    """Whether images of any size get the same focal length in pixels, which is right for one size alone."""
     return isinstance(lens, MatrixOnly) or (isinstance(lens, FieldOfView) and lens.focal_px is not None)
 
 
@@ -143,7 +143,7 @@ def sized_lens(lens: Lens, size: tuple[int, int] | None, scale: bool) -> Lens:
     Args:
         lens: what a camera file gave.
         size: width and height that the calibration is for, where its file does not state them.
-        scale: the pictures were resized, so the camera follows their size.
+        scale: the images were resized, so the camera follows their size.
 
     Raises:
         GknetError: the file states another size, or an option is missing or has nothing to work on.

@@ -1,4 +1,4 @@
-"""Estimates as text: one JSON object or one CSV row for each picture, in a file that appears when the run ends."""
+"""Estimates as text: one JSON object or one CSV row for each image, in a file that appears when the run ends."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _plain(value: ndarray | float | None) -> object:
 
 
 def record(name: str, time_s: float | None, estimate: Estimate, keypoint_names: Sequence[str]) -> dict[str, object]:
-    """The JSON object of one picture; poses are cam_from_body, lengths in metres, pixels of the full image."""
+    """The JSON object of one image; poses are cam_from_body, lengths in metres, pixels of the full image."""
     pose, box = estimate.cam_from_body, estimate.box
     return {
         "name": writable(name),
@@ -71,7 +71,7 @@ def _keypoint_records(estimate: Estimate, names: Sequence[str]) -> list[dict[str
 
 
 def unreadable_record(name: str, failure: Failure) -> dict[str, object]:
-    """The JSON object of a picture that could not be read."""
+    """The JSON object of an image that could not be read."""
     return {"name": writable(name), "time_s": None, "status": "unreadable", "failure": _failure_record(failure)}
 
 
@@ -84,9 +84,9 @@ class PoseLine:
     """One line of a file of poses.
 
     Attributes:
-        name: The picture's, as it stands in the file.
+        name: The image's, as it stands in the file.
         failure: Why there is no pose; None when there is one.
-        is_unreadable: The picture could not be read.
+        is_unreadable: The image could not be read.
         is_ambiguous: The network gives a higher probability to other attitudes than to the pose's.
         text: The line as it stands in the file, with its end.
     """
@@ -133,11 +133,11 @@ class PoseWriter:
         return self
 
     def add(self, name: str, time_s: float | None, estimate: Estimate) -> None:
-        """Append the answer for one picture."""
+        """Append the answer for one image."""
         self._write(record(name, time_s, estimate, self._names))
 
     def add_unreadable(self, name: str, failure: Failure) -> None:
-        """Append a picture that could not be read."""
+        """Append an image that could not be read."""
         self._write(unreadable_record(name, failure))
 
     def _write(self, entry: dict[str, object]) -> None:

@@ -31,7 +31,7 @@ _LINE_ENDS = frozenset("\u2028\u2029")
 
 
 def printable(text: object) -> str:
-    """A name from outside as text that a terminal, a picture and UTF-8 can take.
+    """A name from outside as text that a terminal, an image and UTF-8 can take.
 
     Control characters (ESC among them), line ends, marks that turn the direction of writing and lone surrogates (a file
     name that is not UTF-8) become backslash escapes. Everything else is kept.

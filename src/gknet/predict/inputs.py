@@ -60,7 +60,7 @@ def find_files(inputs: Sequence[str | Path]) -> list[Found]:
     """What the inputs name, in their order; a file that two of them name is there once.
 
     Raises:
-        GknetError: an input is empty or does not exist, or there is no picture in any.
+        GknetError: an input is empty or does not exist, or there is no image in any.
     """
     if not inputs:
         raise GknetError("expected an image, video, folder, pattern or list, got no input")
@@ -170,7 +170,7 @@ def _of_folder(root: str) -> list[Found]:
         for file in files:
             path = os.path.join(folder, file)
             taken = file not in own and file[0] != "." and _kind(file) is not None
-            if taken and (os.path.isfile(path) or os.path.islink(path)):  # a broken link is a picture that is missing
+            if taken and (os.path.isfile(path) or os.path.islink(path)):  # a broken link is an image that is missing
                 found.append(_file(path, f"{prefix}{file}"))
     return sorted(found, key=lambda item: natural_key(item.path))
 
@@ -180,11 +180,11 @@ def _listed(path: Path) -> Iterator[Found]:
     lines = [line.strip() for line in read_text(path, limit_bytes=2**28).splitlines()]
     inputs = [line for line in lines if line and not line.startswith("#")]
     if not inputs:
-        raise GknetError(f"{path}: expected a list with the path of a picture or video on each line, found none")
+        raise GknetError(f"{path}: expected a list with the path of an image or video on each line, found none")
     for line in inputs:
         text = line if line.startswith(STREAM_SCHEMES) else os.path.join(path.parent, line)
         if Path(text).suffix.lower() == LIST_SUFFIX or os.path.basename(line).startswith("@"):
-            raise GknetError(f"{path}: expected pictures and videos, got another list, {quoted(line)}")
+            raise GknetError(f"{path}: expected images and videos, got another list, {quoted(line)}")
         if not os.path.lexists(text) and _kind(text) is not None and not _is_pattern(text):
             yield Found(Kind.BAD, text, line, f"{text}: no such file, though it is listed in {path}")
         else:

@@ -1,4 +1,4 @@
-"""Overlay pictures and the overlay video of a run. What cannot be written is counted, and costs nothing else."""
+"""Overlay images and the overlay video of a run. What cannot be written is counted, and costs nothing else."""
 
 from __future__ import annotations
 
@@ -52,17 +52,17 @@ class Losses:
 
 @dataclass
 class OverlayNames:
-    """File names of overlays, one for each picture: two pictures of a run never share one.
+    """File names of overlays, one for each image: two images of a run never share one.
 
-    The same pictures in the same order have the same names in every run.
+    The same images in the same order have the same names in every run.
     """
 
     _used: set[str] = field(default_factory=set)
 
     def name_for(self, picture: str) -> str:
-        """The file name for a picture: folders become part of it, the suffix becomes .jpg.
+        """The file name for an image: folders become part of it, the suffix becomes .jpg.
 
-        Where another picture has that name, the suffix is kept before .jpg, and then a number follows.
+        Where another image has that name, the suffix is kept before .jpg, and then a number follows.
         """
         whole = _FORBIDDEN.sub("_", printable(picture))
         wanted = chain([os.path.splitext(whole)[0], whole], (f"{whole}-{number}" for number in count(2)))
@@ -88,7 +88,7 @@ class OverlayFolder:
     losses: Losses = field(default_factory=lambda: Losses("overlay"))
 
     def write(self, name: str, picture: UInt8[ndarray, "h w 3"]) -> None:
-        """Write the overlay of a picture, or count it as lost."""
+        """Write the overlay of an image, or count it as lost."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with quiet():

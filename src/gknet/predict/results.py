@@ -1,4 +1,4 @@
-"""The results of a run over many pictures: poses as text, overlay pictures and an overlay video."""
+"""The results of a run over many images: poses as text, overlay images and an overlay video."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class PredictionWriter:
         poses_path: The file of poses.
         overlay_folder: Of the overlays; None when there are none.
         video_path: The video; None when there is none.
-        pose_count: Pictures with a pose.
+        pose_count: Images with a pose.
         ambiguous_count: Those of them whose pose is ambiguous.
         failures: The others, each with its reason.
-        image_sizes: Width and height of the pictures of this run, in the order in which they came.
-        kept_count: Pictures of an earlier run that was gone on with; they count in the three before.
+        image_sizes: Width and height of the images of this run, in the order in which they came.
+        kept_count: Images of an earlier run that was gone on with; they count in the three before.
 
     Raises:
         GknetError: On entering: another process writes into the folder, or it holds results of another run.
@@ -94,7 +94,7 @@ class PredictionWriter:
 
     @property
     def count(self) -> int:
-        """Pictures so far."""
+        """Images so far."""
         return self.pose_count + len(self.failures)
 
     @property
@@ -104,14 +104,14 @@ class PredictionWriter:
         return [loss.sentence for loss in found if loss.sentence is not None]
 
     def is_kept(self, name: str) -> bool:
-        """Whether the answer for the next picture of this name is there from an earlier run."""
+        """Whether the answer for the next image of this name is there from an earlier run."""
         if self._kept[printable(name)] == 0:
             return False
         self._kept[printable(name)] -= 1
         return True
 
     def add(self, frame: Frame, estimate: Estimate) -> None:
-        """Record the answer for one picture; a missing pose is counted and kept with its reason."""
+        """Record the answer for one image; a missing pose is counted and kept with its reason."""
         self._opened().add(frame.name, frame.time_s, estimate)
         self.image_sizes[frame.camera.width, frame.camera.height] = None
         self._count(frame.name, estimate.failure, estimate.is_ambiguous)
@@ -127,7 +127,7 @@ class PredictionWriter:
                 output.write(frame.name, picture)
 
     def add_unreadable(self, picture: Unreadable) -> None:
-        """Record a picture that could not be read."""
+        """Record an image that could not be read."""
         self._opened().add_unreadable(picture.name, picture.failure)
         self._count(picture.name, picture.failure, False)
 
@@ -218,7 +218,7 @@ def _remove_results(folder: Path) -> None:
 
 
 def _remove_overlays(folder: Path) -> None:
-    """Remove the overlays of the pictures that an earlier run's poses name."""
+    """Remove the overlays of the images that an earlier run's poses name."""
     for layout in LAYOUTS:
         names = OverlayNames()
         for line in read_poses(folder / f"poses.{layout}", layout):

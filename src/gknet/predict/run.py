@@ -1,4 +1,4 @@
-"""The loop of a prediction: pictures through an estimator into files."""
+"""The loop of a prediction: images through an estimator into files."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ def predict_all(
     box: Box | None = None,
     oracle: bool = False,
 ) -> None:
-    """Estimate the pose in each picture and hand it to the writer.
+    """Estimate the pose in each image and hand it to the writer.
 
-    A picture that cannot be read, or that the estimator refuses, is recorded and skipped. A picture that the writer
+    An image that cannot be read, or that the estimator refuses, is recorded and skipped. An image that the writer
     has from an earlier run is skipped.
 
     Args:
-        pictures: Frames with images, in order, such as a `gknet.predict.source.Source`.
+        images: Frames with images, in order, such as a `gknet.predict.source.Source`.
         estimator: Of the spacecraft that is sought.
         writer: Entered by the caller.
-        box: Where the spacecraft is in every picture, in px; None has the estimator find it.
-        oracle: Take each box from the picture's labels instead. A picture that shows no keypoint by its labels is
+        box: Where the spacecraft is in every image, in px; None has the estimator find it.
+        oracle: Take each box from the image's labels instead. An image that shows no keypoint by its labels is
             recorded as a failure of the kind `no_keypoint_in_view`.
 
     Raises:
-        GknetError: With `oracle`, a picture has no true pose.
+        GknetError: With `oracle`, an image has no true pose.
         OSError: The poses cannot be written.
-        gknet.io.interrupt.Interrupted: A stop signal came. The poses of all pictures before it are recorded.
+        gknet.io.interrupt.Interrupted: A stop signal came. The poses of all images before it are recorded.
     """
     with Interruption() as interruption:
         for picture in pictures:
@@ -63,11 +63,11 @@ def _estimate(frame: Frame, estimator: PoseEstimator, box: Box | None, oracle: b
     if oracle:
         box = frame.true_box(estimator.spacecraft.points_m)
         if box is None:
-            return Estimate(failure=Failure(FailureKind.NO_KEYPOINT_IN_VIEW, "the picture shows no keypoint"))
+            return Estimate(failure=Failure(FailureKind.NO_KEYPOINT_IN_VIEW, "the image shows no keypoint"))
     return estimator.estimate(frame.image, frame.camera, box)
 
 
 def _kept_words(writer: PredictionWriter) -> str:
     if writer.count == 0:
         return ""
-    return f"{writer.folder} holds the results of {counted(writer.count, 'picture')}; --resume goes on with them"
+    return f"{writer.folder} holds the results of {counted(writer.count, 'image')}; --resume goes on with them"

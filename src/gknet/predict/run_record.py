@@ -21,13 +21,13 @@ class RunRecord:
     """What the poses of a run depend on. Two runs with equal records find the same poses.
 
     Attributes:
-        inputs: Absolute paths or addresses of the pictures.
+        inputs: Absolute paths or addresses of the images.
         model: Absolute path of the model's folder.
         camera: The camera option and its value; empty for a dataset, which brings its own camera.
         box: x0, y0, x1, y1 in px as given; None when it is found or taken from the labels.
         oracle: The box comes from the labels of a dataset.
         split: Of a dataset; None for all.
-        every: Each n-th picture was taken.
+        every: Each n-th image was taken.
         bit_depth: Of images of more than 8 bits, as given.
         tta_rotations: See `gknet.inference.crop_estimator.InferenceSettings`.
         version: Of gknet.

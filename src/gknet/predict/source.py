@@ -27,16 +27,16 @@ LIVE_FRAMES = 100_000
 
 
 class Source(Protocol):
-    """Pictures in order."""
+    """Images in order."""
 
     @property
     def count(self) -> int:
-        """How many pictures are expected."""
+        """How many images are expected."""
         ...
 
     @property
     def fps(self) -> float | None:
-        """Pictures per second, where they are those of one video."""
+        """Images per second, where they are those of one video."""
         ...
 
     def __iter__(self) -> Iterator[Frame | Unreadable]: ...
@@ -48,7 +48,7 @@ class ImageFiles:
 
     Attributes:
         files: what `find_files` found; a file that cannot be read is reported.
-        lens: gives each picture the camera of its size.
+        lens: gives each image the camera of its size.
         bit_depth: see `gknet.io.image.read_image_file`.
     """
 
@@ -77,7 +77,7 @@ class ImageFiles:
             else:
                 yield _frame(file.name, picture.image, self.lens)
             if more_pages:
-                reason = "only the first page (or picture of the animation) was read; save the others as files"
+                reason = "only the first page (or image of the animation) was read; save the others as files"
                 yield Unreadable.because(f"{file.name}: further pages", f"{printable(file.path)}: {reason}")
 
 
@@ -152,7 +152,7 @@ def _video_frame(shown: VideoFrame, name: str, place: object, lens: Lens) -> Fra
 
 
 def _frame(name: str, image: UInt8[ndarray, "h w 3"], lens: Lens, time_s: float | None = None) -> Frame | Unreadable:
-    """A picture with the camera of its size."""
+    """An image with the camera of its size."""
     try:
         camera = camera_for(lens, image.shape[1], image.shape[0])
     except GknetError as error:
@@ -212,14 +212,14 @@ def open_source(
     bit_depth: int | None = None,
     limit: int = LIVE_FRAMES,
 ) -> Source:
-    """The pictures that the inputs name, see `gknet.predict.inputs`.
+    """The images that the inputs name, see `gknet.predict.inputs`.
 
     Args:
         inputs: one or several: images, videos, folders, patterns, lists, camera numbers, URLs; or one SKD dataset.
         lens: the camera of images and videos; a dataset brings its own, and refuses another.
         spacecraft: whose frames are taken from a dataset that holds several.
         split: of a dataset.
-        every: take each n-th picture.
+        every: take each n-th image.
         bit_depth: of image files of more than 8 bits that do not state it.
         limit: how many frames of a camera or a stream are read at most.
 

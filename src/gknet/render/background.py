@@ -46,7 +46,7 @@ def background(shot: Shot, window: Crop) -> Float32[ndarray, "s s 3"]:
 
     Args:
         shot: The frame.
-        window: A square of its full image; the picture has `s = window.size` pixels a side.
+        window: A square of its full image; the image has `s = window.size` pixels a side.
 
     Returns:
         (s, s, 3) linear RGB radiance.

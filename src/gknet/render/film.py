@@ -1,4 +1,4 @@
-"""The picture and labels of `shading` by Mitsuba's own camera and film, for its scalar variants: they have no batches.
+"""The image and labels of `shading` by Mitsuba's own camera and film, for its scalar variants: they have no batches.
 
 Some twenty times slower, and needs no LLVM.
 """

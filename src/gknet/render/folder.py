@@ -110,7 +110,7 @@ def finish(job: Job, sequence: int, spacecraft: Spacecraft) -> None:
 
 
 def _whole_camera(job: Job) -> Camera:
-    """The whole sensor's camera, at the size of the pictures when they show all of it."""
+    """The whole sensor's camera, at the size of the images when they show all of it."""
     if job.options.window == "target":
         return CAMERA
     whole = Crop(0, 0, max(CAMERA.width, CAMERA.height), job.options.side_px)

@@ -32,7 +32,7 @@ class Progress:
     Attributes:
         total: Frames to render.
         done: Frames rendered so far.
-        failures: Reasons so far, one for each frame that has no picture.
+        failures: Reasons so far, one for each frame that has no image.
         seconds: Since rendering began.
     """
 
@@ -50,7 +50,7 @@ class Generated:
         out: The dataset's folder.
         rendered: Frames that are new.
         kept: Selected frames that were there before.
-        failures: Reasons, one for each frame that has no picture.
+        failures: Reasons, one for each frame that has no image.
         render_seconds: Of rendering the new frames; 0 when there were none.
         seconds: Of the whole run, with its preparation and the contact sheet.
     """

@@ -91,7 +91,7 @@ def read_glb(path: Path) -> list[MeshPart]:
     """The parts of a GLB, node transforms applied.
 
     Args:
-        path: A GLB file that holds its buffers and its pictures itself; links to other files are not followed.
+        path: A GLB file that holds its buffers and its images itself; links to other files are not followed.
 
     Returns:
         One part for each material, in metres, in the frame of the GLB's scene, which is the body frame.

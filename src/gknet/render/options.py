@@ -9,7 +9,7 @@ from gknet.errors import GknetError
 
 WINDOWS = ("frame", "target")
 DEFAULT_SIZE = {"frame": 1024, "target": 320}
-"""Pixels of a picture's side, for each kind of window."""
+"""Pixels of an image's side, for each kind of window."""
 
 LARGEST_SEED = 2**53
 LARGEST_SIZE_PX = 4096
@@ -28,7 +28,7 @@ class Options:
 
     Attributes:
         seed: The same seed gives the same frames.
-        window: frame: the whole picture; target: a square around the spacecraft, with its own camera.
+        window: frame: the whole image; target: a square around the spacecraft, with its own camera.
         size: Pixels of a side; by default 1024, for target at most 320.
         spp: Samples per pixel: 4, 8, 16 or 64.
         mask: Write masks; by default for frame only.
@@ -54,7 +54,7 @@ class Options:
 
     @property
     def side_px(self) -> int:
-        """Pixels of the picture's side; for target windows the largest."""
+        """Pixels of the image's side; for target windows the largest."""
         return DEFAULT_SIZE[self.window] if self.size is None else self.size
 
     @property

@@ -123,7 +123,7 @@ def target_window(box: Box, size: int, seed: int) -> Crop:
 
     Args:
         box: Of the keypoints, in pixels of the full image.
-        size: The picture has at most so many pixels a side.
+        size: The image has at most so many pixels a side.
         seed: Of the jitter.
     """
     random = np.random.default_rng([seed, 0x7A6])

@@ -78,11 +78,11 @@ class Renderer:
         self._shader = None if engine.scalar else Shader(engine, self._scene, spp)
 
     def render(self, shot: Shot, window: Crop) -> Rendered:
-        """The spacecraft in a part of a shot's picture; the same shot gives the same bits.
+        """The spacecraft in a part of a shot's image; the same shot gives the same bits.
 
         Args:
             shot: Poses are cam_from_body in the OpenCV camera frame, lengths in m.
-            window: A square of the shot's full image, in its pixels; the picture has `window.size` pixels a side.
+            window: A square of the shot's full image, in its pixels; the image has `window.size` pixels a side.
 
         Raises:
             GknetError: The camera has skew or pixels that are not square, or the spacecraft is inside the Earth.
@@ -141,7 +141,7 @@ def light_of(shot: Shot) -> IncidentLight:
 
 
 def region_of(camera: Camera, hull_cam_m: Float[ndarray, "v 3"]) -> Region | None:
-    """The part of a window that the convex hull of the mesh may cover, None when it is out of the picture."""
+    """The part of a window that the convex hull of the mesh may cover, None when it is out of the image."""
     whole = Region(0, 0, camera.width, camera.height)
     if (hull_cam_m[:, 2] <= 0).all():
         return None

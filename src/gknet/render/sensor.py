@@ -35,7 +35,7 @@ class Sensor:
         full_well_e: Electrons of a full pixel.
         read_noise_e: Standard deviation of the read-out noise, in electrons.
         bloom: Part of the light that scatters into a wide halo.
-        veil: Stray light of the sun over the whole picture, in radiance.
+        veil: Stray light of the sun over the whole image, in radiance.
         gamma: Pixel = 255 signal^(1 / gamma).
         monochrome: Whether the three channels have one luminance.
         jpeg_quality: Of the file, 1 to 100.
@@ -53,7 +53,7 @@ class Sensor:
 
 
 def expose(radiance: Float[ndarray, "h w 3"], sensor: Sensor, scale: float, seed: int) -> UInt8[ndarray, "h w 3"]:
-    """The picture that the sensor makes of light; the same arguments give the same picture.
+    """The image that the sensor makes of light; the same arguments give the same image.
 
     Shot noise is taken as Gaussian: below some 20 electrons, where it is not, the read noise covers it.
 

@@ -68,12 +68,12 @@ def _tint(colour_index: Float[ndarray, " n"]) -> Float[ndarray, "n 3"]:
 def add_stars(
     picture: Float32[ndarray, "s s 3"], camera: Camera, window: Crop, cam_from_inertial: Float[ndarray, "3 3"]
 ) -> None:
-    """Add stars to a picture; the four pixels about a star share its light, none of it lost.
+    """Add stars to an image; the four pixels about a star share its light, none of it lost.
 
     Args:
-        picture: (s, s, 3) linear RGB radiance, changed in place.
+        image: (s, s, 3) linear RGB radiance, changed in place.
         camera: Of the full image.
-        window: The square of the full image that the picture shows.
+        window: The square of the full image that the image shows.
         cam_from_inertial: (3, 3) rotation from equatorial axes.
     """
     stars = catalogue()

@@ -73,7 +73,7 @@ def choose_variant() -> str:
 
 
 def variant_works(variant: str) -> bool:
-    """Whether another process renders a small picture with it."""
+    """Whether another process renders a small image with it."""
     command = [sys.executable, "-c", PROBE, variant]
     environment = {**os.environ, "HOME": str(drjit_home())}
     try:

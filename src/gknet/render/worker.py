@@ -38,7 +38,7 @@ class RenderedFrame:
         mask: (s, s) whether the ray of the pixel's centre meets the spacecraft.
         depth_m: (s, s) z of that point in the camera frame in m, 0 outside of the mask.
         visible: (n,) whether each keypoint is in the full image and not hidden.
-        camera: Of this picture, which may be a part of the full image.
+        camera: Of this image, which may be a part of the full image.
     """
 
     rgb: UInt8[ndarray, "s s 3"]
@@ -55,7 +55,7 @@ class Outcome:
     Attributes:
         sequence: Of the chunk.
         done: The number of frames that are on disk now.
-        failures: Reasons, one for each frame that has no picture.
+        failures: Reasons, one for each frame that has no image.
     """
 
     sequence: int
@@ -90,7 +90,7 @@ class WorkerState:
 
 
 def render_shot(renderer: Renderer, spacecraft: Spacecraft, shot: Shot, window: Crop) -> RenderedFrame:
-    """The picture of a window as the sensor gives it: black beyond its edge, as where a crop leaves an image.
+    """The image of a window as the sensor gives it: black beyond its edge, as where a crop leaves an image.
 
     Args:
         renderer: Of the spacecraft.

@@ -1,4 +1,4 @@
-"""The worst, some random and the best frames of a run, as small pictures for the page."""
+"""The worst, some random and the best frames of a run, as small images for the page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WEIGHT = 1.6
 
 @dataclass(frozen=True)
 class GalleryPicture:
-    """A picture of a gallery.
+    """An image of a gallery.
 
     Attributes:
         data_uri: A JPEG.
@@ -42,7 +42,7 @@ class GalleryPicture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures under a title."""
+    """Images under a title."""
 
     title: str
     pictures: tuple[GalleryPicture, ...]
@@ -55,7 +55,7 @@ def galleries(run: ProtocolRun, dataset: SkdDataset, spacecraft: Spacecraft, cou
         run: The errors.
         dataset: Where the frames are read from.
         spacecraft: That is drawn.
-        count: Pictures in each gallery.
+        count: Images in each gallery.
 
     Raises:
         GknetError: A frame cannot be read any more.
@@ -76,7 +76,7 @@ def data_uri(image: UInt8[ndarray, "h w 3"], quality: int = _QUALITY) -> str:
     """An RGB image (h, w, 3) as an inline JPEG; `quality` is 1 to 100."""
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise GknetError("gallery: a picture could not be encoded")
+        raise GknetError("gallery: an image could not be encoded")
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
@@ -99,7 +99,7 @@ def _picture(case: Case, dataset: SkdDataset, spacecraft: Spacecraft) -> Gallery
 
 
 def _overlay(frame: Frame, case: Case, spacecraft: Spacecraft) -> UInt8[ndarray, "h w 3"]:
-    """Near the spacecraft: what matters fills the picture, whatever its range."""
+    """Near the spacecraft: what matters fills the image, whatever its range."""
     box = frame.true_box(spacecraft.points_m)
     if box is None or frame.camera.distorted:
         image = draw_overlay(frame, spacecraft, case.estimate, lines=(), legend=False, weight=_WEIGHT)

@@ -57,7 +57,7 @@ def draw_legend(canvas: Canvas, entries: Sequence[Entry]) -> None:
 
 
 def legend_strip(width_px: int, entries: Sequence[Entry], weight: float) -> UInt8[ndarray, "h w 3"]:
-    """A legend as a picture of its own, as high as its rows need.
+    """A legend as an image of its own, as high as its rows need.
 
     Args:
         width_px: Of the strip.

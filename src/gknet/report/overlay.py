@@ -43,13 +43,13 @@ def draw_overlay(
     """Draw an estimate, and the truth where it is known, on a copy of the frame's image.
 
     Args:
-        frame: The picture with its camera.
+        frame: The image with its camera.
         spacecraft: Whose skeleton is drawn.
         estimate: Of the pose.
         lines: The text of the panel; None writes `describe(frame, estimate)`.
         truth: Draw the true skeleton too, where the frame has a pose.
         legend: Explain the marks along the lower edge.
-        weight: Of lines, marks and text; more than 1 for a picture that is shown small.
+        weight: Of lines, marks and text; more than 1 for an image that is shown small.
 
     Returns:
         (h, w, 3) RGB; a small image is enlarged by a whole factor.
@@ -108,7 +108,7 @@ def _range_words(position_m: Float[ndarray, "3"], covariance: Float[ndarray, "6 
 
 
 def _short(name: str) -> str:
-    """The end of a long name, which differs more between pictures than its start."""
+    """The end of a long name, which differs more between images than its start."""
     return name if len(name) <= _NAME_CHARACTERS else f"...{name[-_NAME_CHARACTERS + 3 :]}"
 
 

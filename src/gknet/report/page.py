@@ -1,4 +1,4 @@
-"""One HTML file that shows evaluations: it holds its own style, charts and pictures, and asks for nothing else."""
+"""One HTML file that shows evaluations: it holds its own style, charts and images, and asks for nothing else."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Section:
 
     Attributes:
         evaluation: The errors.
-        galleries: Pictures, in the order of the page.
+        galleries: Images, in the order of the page.
     """
 
     evaluation: Evaluation
@@ -153,7 +153,7 @@ def _glossary() -> str:
     meanings = [(row.title, row.meaning) for row in ROWS] + list(COUNT_MEANINGS)
     terms = "".join(f"<dt>{escaped(title)}</dt><dd>{escaped(meaning)}</dd>" for title, meaning in meanings)
     return (
-        '<section><h2>How to read this</h2><p>In the pictures the estimate is <span class="estimate">blue</span>, the '
+        '<section><h2>How to read this</h2><p>In the images the estimate is <span class="estimate">blue</span>, the '
         "truth white and dashed. Pink brackets are the box, arrows the body axes X (red), Y (green) and Z (blue). "
         "Keypoints are coloured by score, from vermillion (0) to pale yellow (1): a disc is visible, a ring is hidden "
         "by the spacecraft, a square is of unknown visibility, and a cross is an outlier, which has no part in the "

@@ -1,4 +1,4 @@
-"""An evaluation with its pictures, and the two files that hold it: metrics.json and report.html."""
+"""An evaluation with its images, and the two files that hold it: metrics.json and report.html."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def evaluate_section(
     pictures: int,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Section:
-    """Evaluate an estimator, and draw the pictures for the page.
+    """Evaluate an estimator, and draw the images for the page.
 
     Args:
         dataset: Frames with true poses.
         estimator: One without a locator is run with the oracle's crop alone.
         data: Words for the report: where the frames come from.
-        pictures: In each gallery.
+        images: In each gallery.
         on_frame: Called after each frame, for a progress bar.
 
     Raises:

@@ -39,7 +39,7 @@ LAYOUT = 3
 
 IMAGES, LABELS, HEADER = "images.u8", "labels.npz", "cache.json"
 
-Window = Literal["craft", "picture"]
+Window = Literal["craft", "image"]
 
 
 @runtime_checkable
@@ -157,7 +157,7 @@ def build_cache(
         spacecraft: Of the frames.
         place: The folder of this cache alone. What else it holds is removed when the cache is built.
         size: Side of the crops in pixels.
-        window: "craft" or "picture".
+        window: "craft" or "image".
         stamp: Stands for the images' content, such as sizes and times of the files.
         workers: Threads.
         advance: Called with (done, total) while the cache is built.

@@ -63,7 +63,7 @@ class Budget:
 
     Attributes:
         minutes: By the clock; or
-        samples: pictures seen. Exactly one of the two.
+        samples: images seen. Exactly one of the two.
     """
 
     minutes: float | None = None

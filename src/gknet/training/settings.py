@@ -52,7 +52,7 @@ class TrainSettings:
         network: gknet-s, gknet-xs, hrnet-xs, resunet-xs, dmanet-xs, gknet-paper, hrnet, resunet, dmanet or locator.
         graph: skeleton, identity (no edges), random (as many) or none (no graph branch).
         loss: likelihood or squared; left out, the network's own.
-        samples: Budget in pictures seen, by all devices together.
+        samples: Budget in images seen, by all devices together.
         epochs: Budget in passes over the data.
         minutes: Budget by the clock, for convenience: such a run cannot be repeated exactly.
         stages: share:input_size:batch,... such as 0.4:128:32,0.6:256:32; left out, the network's own.
@@ -68,7 +68,7 @@ class TrainSettings:
         device: auto, cpu, cuda or mps.
         devices: How many; more than one train with DDP.
         precision: auto, 32-true, bf16-mixed or 16-mixed.
-        workers: Threads that decode pictures for the cache.
+        workers: Threads that decode images for the cache.
         val_frames: Frames of the val split to validate on, evenly spread.
         validations: How many there are over the budget.
         cache_size: Side of the cached crops in pixels.
@@ -138,7 +138,7 @@ class TrainSettings:
     @property
     def window(self) -> Window:
         """The part of a frame that is the network's input."""
-        return "picture" if spec_of(self.network).kind == "locator" else "craft"
+        return "image" if spec_of(self.network).kind == "locator" else "craft"
 
     @property
     def fixed(self) -> dict[str, str]:

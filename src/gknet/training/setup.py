@@ -27,7 +27,7 @@ from gknet.training.tasks import DirectTask, KeypointTask, LocatorTask, Task
 logger = logging.getLogger(__name__)
 
 BF16_FLAGS = {"avx512_bf16", "amx_bf16"}
-PICTURE_SIZE = 256
+IMAGE_SIZE = 256
 """Side of a cached whole image: the locator's input."""
 
 
@@ -114,7 +114,7 @@ def check_cameras(network: Network, frames: FrameSource) -> None:
         if not has_square_pixels(frame.camera):
             ratio = frame.camera.matrix[0, 0] / frame.camera.matrix[1, 1]
             raise GknetError(
-                f"{frame.name}: expected square pixels, got fx / fy of {ratio:.3f}; resize the pictures to train on"
+                f"{frame.name}: expected square pixels, got fx / fy of {ratio:.3f}; resize the images to train on"
             )
 
 
@@ -131,7 +131,7 @@ def open_cache(
     """
     from gknet.io.progress import progress
 
-    size = PICTURE_SIZE if settings.window == "picture" else settings.cache_size
+    size = IMAGE_SIZE if settings.window == "image" else settings.cache_size
     with progress() as bar:
         task = bar.add_task("decoding", total=len(data))
         return build_cache(
@@ -155,12 +155,12 @@ def _cache_name(data: SkdDataset, folder: Path, kind: str) -> str:
 
 
 def picture_stamp(data: SkdDataset) -> str:
-    """Sizes and times of all picture files in one digest, which changes with any of them."""
+    """Sizes and times of all image files in one digest, which changes with any of them."""
     digest = hashlib.sha256()
     for row in range(len(data)):
         try:
             file = data.extras(row).image_path.stat()
-        except (GknetError, OSError):  # no label or no picture: the cache leaves the frame out
+        except (GknetError, OSError):  # no label or no image: the cache leaves the frame out
             digest.update(b"-")
         else:
             digest.update(f"{file.st_size}:{file.st_mtime_ns};".encode())
