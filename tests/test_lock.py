@@ -11,6 +11,8 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
+PINNED_BY_TORCH = ("nvidia-", "cuda-", "triton")
+"""What a CUDA build of torch brings, each in a release that torch itself names."""
 
 
 def canonical(name: str) -> str:
@@ -47,7 +49,8 @@ def needed(extras: tuple[str, ...]) -> set[str]:
 
 @pytest.mark.parametrize("extras", [(), ("render", "train", "docs", "dev")], ids=["make demo", "make test"])
 def test_every_package_is_pinned(extras: tuple[str, ...]) -> None:
-    assert needed(extras) - set(pins()) - {"setuptools"} == set()
+    missing = needed(extras) - set(pins()) - {"setuptools"}
+    assert {name for name in missing if not name.startswith(PINNED_BY_TORCH)} == set()
 
 
 def test_the_tests_run_with_the_pinned_releases() -> None:

@@ -381,14 +381,14 @@ def test_byte_order_marks_are_no_fault(written: Written) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "named"),
     [
-        ("train.json", 5000 * "[" + 5000 * "]", "nested too deeply"),
+        ("train.json", 100_000 * "[" + 100_000 * "]", "nested too deeply"),
         ("train.json", f'{{"Satellite_01": {"9" * 5000}}}', "digits"),
         ("train.json", '{"Satellite_01": ["../other/data/000001"]}', "inside of the dataset"),
         ("train.json", '{"Satellite_01": ["/etc"]}', "inside of the dataset"),
         ("data/000001/keypoints.txt", "1 2 3\n" * 8000, "at most"),
         ("data/000001/keypoints.txt", "1e308 2 3\n" * 5, "keypoints"),
         ("data/000001/skeleton.json", '{"keypoint_names": 3}', "keypoint_names"),
-        ("data/000001/skeleton.json", 5000 * "[" + 5000 * "]", "nested too deeply"),
+        ("data/000001/skeleton.json", 100_000 * "[" + 100_000 * "]", "nested too deeply"),
     ],
 )
 def test_files_beyond_all_bounds_are_one_line(written: Written, file: str, content: str, named: str) -> None:
