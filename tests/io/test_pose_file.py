@@ -147,6 +147,16 @@ def test_lines_come_back(tmp_path: Path, layout: PoseFormat) -> None:
     assert read_poses(tmp_path / "none", layout) == []
 
 
+def test_a_table_whose_columns_are_damaged_keeps_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    with PoseWriter(path, NAMES, "csv") as writer:
+        writer.add("a", None, estimate())
+    for column in ("name", "failure_detail", "attitude_confidence"):
+        damaged = tmp_path / f"{column}.csv"
+        damaged.write_text(path.read_text().replace(column, column[:-1], 1))
+        assert read_poses(damaged, "csv") == []
+
+
 def test_a_full_disk_leaves_whole_lines(tmp_path: Path) -> None:
     """With the size of files limited, the write that passes the limit fails as on a full disk."""
     code = """

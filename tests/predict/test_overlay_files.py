@@ -44,6 +44,12 @@ def test_names(pictures: list[str], expected: list[str]) -> None:
     assert [names.name_for(picture) for picture in pictures] == expected
 
 
+def test_names_suit_a_file_system_of_ascii_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.getfilesystemencoding", lambda: "ascii")
+    names = OverlayNames()
+    assert [names.name_for(name) for name in ("cafe\u0301.png", "cafe\u0302.png")] == ["cafe_.jpg", "cafe_.png.jpg"]
+
+
 def test_long_names_differ_and_keep_their_ends() -> None:
     names = OverlayNames()
     found = {names.name_for(f"{start}{'é' * 200}_0001.png") for start in "ab"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,11 +13,13 @@ pytest.importorskip("torch")
 import torch
 
 from gknet.errors import GknetError
+from gknet.io.torch_file import load_torch_file
 from gknet.training.checkpoint import (
     BEST,
     CHECKPOINT,
     TrainingState,
     load_checkpoint,
+    load_weights,
     save_checkpoint,
     save_weights,
 )
@@ -78,3 +81,12 @@ def test_weights_carry_the_validation_that_they_are_of(tmp_path: Path) -> None:
     assert load_run(tmp_path) == replace(run, best={"score": 1.0})
     save_weights(tmp_path / BEST, {"w": torch.zeros(2)}, {})
     assert load_run(tmp_path) == run
+
+
+def test_weights_in_a_pipe_are_refused_before_they_block(tmp_path: Path) -> None:
+    pipe = tmp_path / "weights.safetensors"
+    os.mkfifo(pipe)
+    with pytest.raises(GknetError, match="a folder or a pipe"):
+        load_weights(pipe)
+    with pytest.raises(GknetError, match="a folder or a pipe"):
+        load_torch_file(pipe)

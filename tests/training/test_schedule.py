@@ -19,7 +19,9 @@ def test_stages_follow_their_shares() -> None:
     assert sizes == [128, 128, 256, 256, 256]
 
 
-@pytest.mark.parametrize("text", ["", "1:256", "0.5:256:32", "1:100:32", "1:256:0", "a:b:c", "0.5:128:8,0.6:256:8"])
+@pytest.mark.parametrize(
+    "text", ["", "1:256", "0.5:256:32", "1:100:32", "1:256:0", "1:32:1", "a:b:c", "0.5:128:8,0.6:256:8"]
+)
 def test_bad_stages_are_refused(text: str) -> None:
     with pytest.raises(GknetError, match="stage"):
         parse_stages(text)

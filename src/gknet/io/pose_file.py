@@ -203,7 +203,7 @@ def _csv_entry(line: str, columns: list[str]) -> dict[str, object] | None:
     if len(cells) != len(columns) or not line.endswith("\n"):
         return None
     entry: dict[str, object] = dict(zip(columns, cells, strict=True))
-    if not {"name", "status", "failure_kind"} <= set(entry):
+    if not {"name", "status", "failure_kind", "failure_detail", "attitude_confidence"} <= set(entry):
         return None
     failure = {"kind": entry["failure_kind"], "detail": entry["failure_detail"]} if entry["failure_kind"] else None
     name = str(entry["name"]).removeprefix("'")

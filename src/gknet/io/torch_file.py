@@ -27,6 +27,8 @@ def load_torch_file(path: Path) -> object:
         import torch
     except ImportError as error:
         raise MissingExtraError("train", "torch") from error
+    if Path(path).exists() and not Path(path).is_file():
+        raise GknetError(f"{path}: expected a file, got a folder or a pipe")
     try:
         with warnings.catch_warnings(action="ignore"):
             return torch.load(path, map_location="cpu", weights_only=True)

@@ -71,6 +71,8 @@ class Stage:
             )
         if not 1 <= self.batch <= LARGEST_BATCH:
             raise GknetError(f"stage: expected a batch of 1 to {LARGEST_BATCH}, got {self.batch}")
+        if self.batch == 1 and self.input_size == 32:  # one cell of the coarsest map has no variance to normalise by
+            raise GknetError("stage: expected a batch of 2 or more at an input size of 32, got 1")
 
 
 @dataclass(frozen=True, eq=False)

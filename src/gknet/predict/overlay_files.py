@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import sys
 from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
@@ -64,11 +65,17 @@ class OverlayNames:
 
         Where another image has that name, the suffix is kept before .jpg, and then a number follows.
         """
-        whole = _FORBIDDEN.sub("_", printable(picture))
+        whole = _for_file_system(_FORBIDDEN.sub("_", printable(picture)))
         wanted = chain([os.path.splitext(whole)[0], whole], (f"{whole}-{number}" for number in count(2)))
         stem = next(stem for name in wanted if (stem := _short(name)).casefold() not in self._used)
         self._used.add(stem.casefold())
         return f"{stem}.jpg"
+
+
+def _for_file_system(name: str) -> str:
+    """The name, with an underscore for each character that this system's file names cannot hold."""
+    encoding = sys.getfilesystemencoding()
+    return name.encode(encoding, "replace").decode(encoding).replace("?", "_")
 
 
 def _short(name: str) -> str:

@@ -167,6 +167,8 @@ def load_weights(path: Path) -> dict[str, Tensor]:
     Raises:
         GknetError: There is no such file, or it is damaged.
     """
+    if path.exists() and not path.is_file():
+        raise GknetError(f"{path}: expected a file of weights, got a folder or a pipe")
     if path.suffix == ".onnx":
         from gknet.training.onnx_graph import weights_of_onnx
 
